@@ -157,7 +157,7 @@ def run(
         raise typer.Exit(0 if is_accurate else 1)
     if name := next((name for name, value in with_error.items() if value), None):
         key = f"--{name.replace('_', '-')}"
-        raise InputError(InputMistake("is of a run with --error; leave it out", key=key))
+        raise InputError(InputMistake("applies only to a run with --error; leave it out", key=key))
     sweep = load_config(config, solvers=solver or (), sizes=size or (), **context.obj)
     if not in_process and not can_isolate_processes():
         print_message("runs share this process, without limits of time and memory: worker processes need Linux")

@@ -142,7 +142,7 @@ class _StudyExpansion:
         """Expand a study into one curve for each problem and minimising solver."""
         how = MeasurementSettings(study.threads, study.rounds, study.time_limit)
         if "coarse-to-fine" in study.initial_guess:
-            problem = "a curve's clock begins at its first guess, and this one is a solve itself; compare it in a sweep"
+            problem = "the time of a curve begins after its initial guess, which here is a solve; compare it in a sweep"
             self.document.add_mistake(f"coarse-to-fine: {problem}", (*at, "initial_guess"))
         if study.recordings and not RECORDINGS.is_installed():
             self.document.add_mistake(RECORDINGS.describe_absence(), (*at, "recordings"))

@@ -157,7 +157,9 @@ class GridExpansion:
                 if name in options.model_fields_set:
                     self.document.add_mistake("is chosen by the `error_target`; leave it out", ("options", name))
         if options.timing == "none" and options.record:
-            problem = "none has no pass that gives the colours of a recording; set `record: false`, or another timing"
+            problem = (
+                "got none, which has no pass for the colours of a recording; set `record: false`, or another timing"
+            )
             self.document.add_mistake(problem, ("options", "timing"))
         entries = [options, *self.fields.include]
         if options.verify and any(AUTO in one.rtol or set(one.error_target) != {None} for one in entries):

@@ -61,7 +61,7 @@ def lock_folder_shared(folder: Path) -> Generator[None]:
         until = monotonic() + _LOCK_TIMEOUT
         while not (first := try_lock_file(lock, LockMode.EXCLUSIVE)) and not try_lock_file(lock, LockMode.SHARED):
             if monotonic() > until:
-                raise InputError(f"{folder}: another springbench has it for itself; wait for it or stop it")
+                raise InputError(f"{folder}: another springbench has locked it exclusively; wait for it or stop it")
             sleep(0.05)
         if first:
             _remove_partial_files(folder)

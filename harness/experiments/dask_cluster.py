@@ -169,7 +169,7 @@ def connect_cluster(
                             f"{scheduler_address} --nthreads 1`"
                         )
                         raise InputError(InputMistake(f"{scheduler_address}: {why}", key="--scheduler")) from None
-                    print_message(f"{scheduler_address}: no worker has come yet")
+                    print_message(f"{scheduler_address}: waiting for the first worker")
             yield DaskCluster(client, check_workers(client, runs, print_message))
 
 
@@ -195,7 +195,7 @@ def check_workers(client: Client, runs: Sequence[RunSpec], print_message: Callab
             print_message(f"the worker {worker} was lost: {answer}")
             continue
         if isinstance(answer, BaseException):
-            problems.append(f"the worker {worker} cannot do runs: {type(answer).__name__}: {answer}")
+            problems.append(f"the worker {worker} cannot execute runs: {type(answer).__name__}: {answer}")
             continue
         about, missing = answer
         for field, title in _VERSION_TITLES.items():
@@ -207,13 +207,14 @@ def check_workers(client: Client, runs: Sequence[RunSpec], print_message: Callab
         off = about.clock_seconds - min(max(about.clock_seconds, before), time())
         if abs(off) > MAX_CLOCK_OFFSET:
             print_message(
-                f"the clock of {worker} is {abs(off):.0f} s {'ahead' if off > 0 else 'behind'}; so are its rows"
+                f"the clock of {worker} is {abs(off):.0f} s {'ahead' if off > 0 else 'behind'}, "
+                "and so are the times in its rows"
             )
     if problems:
         raise InputError([InputMistake(problem, key="--scheduler") for problem in problems])
     answers = [answer for answer in found.values() if not isinstance(answer, OSError)]
     if not answers:
-        raise InputError(InputMistake("all workers were lost; start others", key="--scheduler"))
+        raise InputError(InputMistake("all workers were lost; start new ones", key="--scheduler"))
     return sorted({about.machine_id for about, _ in answers})
 
 
@@ -316,7 +317,7 @@ def execute_on_cluster(
                     tries[number] = tries.get(number, 1) + 1
                     left.append((number, unit))
             if excluded and not set(_read_worker_threads(client)) - excluded:
-                raise WriteError(f"no worker is of use any more: {', '.join(sorted(excluded))}")
+                raise WriteError(f"all workers have failed: {', '.join(sorted(excluded))}")
     finally:
         token.unlink(missing_ok=True)
         display.finish_sweep()
@@ -358,11 +359,11 @@ def _finish_task(
         done: ClusterOutcome = outcome or future.result()
     except KilledWorker as error:
         if is_last_attempt:
-            run.finish_run(unit.write_lost_rows(TaskFailure("killed", f"its worker was lost again and again: {error}")))
+            run.finish_run(unit.write_lost_rows(TaskFailure("killed", f"all attempts lost their worker: {error}")))
         return not is_last_attempt
     if done.worker_error:
         excluded.add(done.worker_address)
-        run.finish_run(f"is done elsewhere, for {done.worker_address} {done.worker_error}")
+        run.finish_run(f"is repeated by another worker: {done.worker_address} {done.worker_error}")
         return True
     for name, content in sorted(done.files.items(), key=lambda item: item[0].endswith(".parquet")):  # rows last
         with atomic_write(folder / name) as partial_name:

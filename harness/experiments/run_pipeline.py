@@ -343,7 +343,9 @@ def _observe_run(job: RunJob, setup: RunSetup, measured: RunMeasurement) -> Obse
         if measured.final_positions is not None and found[run.frames]["positions_digest"] != hash_positions(
             measured.final_positions
         ):
-            raise RunFailed("the recorded pass ended at other positions than the timed pass")
+            raise RunFailed(
+                "the final positions of the recorded pass differ from those of the timed pass; expected equal bits"
+            )
         status_columns = _build_status_columns(run, scene, found)
         if recorder and measured.final_positions is not None:
             from springbench.harness.recording.recording_check import require_recorded_frames

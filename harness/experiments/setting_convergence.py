@@ -229,7 +229,7 @@ class SettingSimulator:
             used = process_time() - started
             projected = used * self.num_frames / frame  # known after a few frames, so that little time is wasted
             if used > time_limit or (frame > _PROJECTION_FRAMES and projected > _PROJECTION_MARGIN * time_limit):
-                raise RunFailed(f"takes longer than {time_limit:g} s")
+                raise RunFailed(f"exceeds the time limit of {time_limit:g} s")
         return samples, strains, seconds, velocity
 
     def measure_sag(self, setting: StepSetting | None) -> float:
@@ -530,12 +530,12 @@ def _find_reference(
     spec, size, times = simulator.spec, simulator.size, simulator.sample_times
     scene = build_exact_scene(spec, size, show_warnings=False)
     smallest = min(error, *ERROR_LEVELS)
-    print_message(f"the reference first, the motion up to {times[-1]:g} s, which is made once")
+    print_message(f"computing the reference motion up to {times[-1]:g} s, once")
     if not has_contact(scene.system):
         try:
             seen = store.load_trajectory(spec, size, times, error=smallest, growth_end=limits.growth_end)
         except NotIntegrable as refused:
-            print_message(f"there is no reference, so that settings are compared with the finest one: {refused}")
+            print_message(f"settings are compared with the finest one, because there is no reference: {refused}")
             return None
         return SampledReference.from_trajectory(scene, seen)
     print_message(describe_self_convergence(spec.path.stem))
@@ -547,11 +547,11 @@ def _find_reference(
         until = times[num_known - 1]
         if limits.is_end_given:
             raise RunFailed(
-                f"with contact an error of {describe_percent(error)} can be measured up to {until:g} s, for later the "
-                f"self-converged motion is known to {trajectory.disagreement.max():.1e} of the displacement only; "
+                f"with contact an error of {describe_percent(error)} can be measured up to {until:g} s; later the "
+                f"self-converged motion is accurate only to {trajectory.disagreement.max():.1e} of the displacement; "
                 f"use --t-end {until:g}, or a larger --error"
             )
-        print_message(f"the motion is known well enough up to {until:g} s, to which the comparison is limited")
+        print_message(f"the comparison is limited to {until:g} s, up to which the reference is accurate enough")
         simulator.shorten_motion(num_known)
     return SampledReference.from_trajectory(scene, trajectory.select_times(slice(num_known)))
 
@@ -569,7 +569,7 @@ def _compare_with_finest(
         raise RunFailed("all settings failed, and there is no reference")
     scene = build_exact_scene(simulator.spec, simulator.size, show_warnings=False)
     start = build_initial_state(scene).motion.positions
-    words = f"the finest setting, {fine.setting}, for there is no reference"
+    words = f"the finest setting, {fine.setting}, because there is no reference"
     reference = SampledReference(words, scene.system.free_vertices, start, fine.positions, None, 0.0, 0.0)
     errors = (inf if one.reason or one is fine else reference.measure_distance(one.positions) for one in results)
     return reference, [replace(one, error=error) for one, error in zip(results, errors, strict=True)]

@@ -186,7 +186,7 @@ def open_recording_source(path: Path) -> Generator[RecordingSource]:
         InputError: the file is not a Rerun recording, is damaged, or contains no readable data.
     """
     if not path.is_file():
-        raise InputError(InputMistake("there is no such file; a Rerun recording (.rrd) was expected", file=path))
+        raise InputError(InputMistake("there is no such file; expected a Rerun recording (.rrd)", file=path))
     with path.open("rb") as file:
         start = file.read(len(_MAGIC))
     if start != _MAGIC:
@@ -208,7 +208,7 @@ def open_recording_source(path: Path) -> Generator[RecordingSource]:
         except (RuntimeError, ValueError) as error:
             raise InputError(InputMistake(f"cannot be read as a Rerun recording: {error}", file=path)) from error
         if not runs:
-            raise InputError(InputMistake("has nothing in it that can be read: it was cut at its start", file=path))
+            raise InputError(InputMistake("contains no readable data; the file is truncated", file=path))
         yield RecordingSource(path, store, complete, runs[0].application_id, runs[0].recording_id)
 
 
@@ -223,7 +223,7 @@ def read_network(source: RecordingSource) -> dict[str, NDArray[Any]]:
         # Rerun writes no column for an empty array: a mesh without springs, or without pins.
         none = dict.fromkeys(("springs", "rest_lengths", "pinned_vertices"), np.empty(0))
         if "layout_version" not in names or int(read_cell(batch, "layout_version")[0]) != LAYOUT_VERSION:
-            problem = "is laid out as another version of springbench did it; do its run again, with --rerun"
+            problem = "has the layout of another version of springbench; repeat its run with --rerun"
             raise InputError(InputMistake(problem, file=source.path))
         return none | {name: read_cell(batch, name) for name in names}
     names = f"application {source.application!r}"
@@ -325,7 +325,7 @@ def read_convergence_frames(source: RecordingSource, entity: str) -> tuple[NDArr
     for chunk in source.iterate_chunks(content=entity.rpartition("/")[0]):
         batch = chunk.to_record_batch()
         return read_cell(batch, "frames").astype(np.int64), read_cell(batch, "times").astype(float)
-    raise InputError(InputMistake(f"does not say which frames {entity} is of", file=source.path))
+    raise InputError(InputMistake(f"does not state the frames of {entity}", file=source.path))
 
 
 def _group_by_frame(table: pa.Table) -> dict[str, tuple[NDArray[np.int64], NDArray[np.float64]]]:

@@ -36,7 +36,7 @@ START_PERTURBATION = 1e-9
 """Initial perturbation relative to the mesh size: a thousand times the round-off of a thousand steps."""
 MIN_RELATIVE_ERROR = 1e-11
 """Minimum relative error that can be requested: the round-off of a thousand steps is close to it."""
-AT_REST_REASON = "nothing moves up to the horizon, and errors are relative to what does"
+AT_REST_REASON = "nothing moves up to the horizon, and errors are relative to the displacement"
 _SAMPLE_SECONDS, _MIN_SAMPLES = 1 / 30, 30
 """Maximum interval between two samples [s], and minimum number of samples."""
 _LINEAR_LIMIT = 1e3

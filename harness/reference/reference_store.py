@@ -367,7 +367,8 @@ class ReferenceStore:
         found, reason = self.load_contact_horizon(spec, size, t_end, error=error)
         if reason:
             raise NotConverged(
-                f"with contact an error of {error:g} can be measured up to {found.times[-1]:.4g} s only, for {reason}; "
+                f"with contact an error of {error:g} can be measured only up to {found.times[-1]:.4g} s, "
+                f"because {reason}; "
                 f"use a --t-end of {found.times[-1]:.4g} or less, or a larger --error"
             )
         return found

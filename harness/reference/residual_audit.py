@@ -84,7 +84,9 @@ class AuditedSolver(DelegatingSolver):
         initial_residual = self._stationarity.compute_initial_residual(problem)
         message, truth = f"{self._name}: reports a residual of {found.residual:.3g} J^(1/2)", reached * initial_residual
         if np.isnan(found.residual) and found.num_iterations:
-            raise RunFailed(f"{message}; expected |Q^-1 grad g|_Q, which is {truth:.3g} (or `is_minimiser = False`)")
+            raise RunFailed(
+                f"{message}; expected |Q^-1 grad g|_Q, which is {truth:.3g}; state `is_minimiser = False` otherwise"
+            )
         claimed = RESIDUAL_SLACK * found.residual / initial_residual + round_off
         enough = (
             RESIDUAL_SLACK * max(stop.rtol or 0.0, stop.atol / initial_residual if initial_residual else 0.0)
@@ -96,10 +98,11 @@ class AuditedSolver(DelegatingSolver):
             before = [self._stationarity(problem, p).stationarity for p in self._find_previous_iterate(problem, found)]
             least = min(reached, *before, np.inf)
             if claimed < least and not is_gradient_roundoff(problem, found.positions, stop.roundoff_floor):
-                raise RunFailed(f"{message}, where |Q^-1 grad g|_Q is {truth:.3g}")
+                raise RunFailed(f"{message}; expected |Q^-1 grad g|_Q, which is {truth:.3g}")
             if enough < least:
                 raise RunFailed(
-                    f"{message} and says that it reached the tolerance, where {least:.3g} of the start's is left"
+                    f"{message} and the reason `converged`; expected a residual within the tolerance, "
+                    f"but it is {least:.3g} of the initial one"
                 )
         return {"stationarity_audit": reached}
 

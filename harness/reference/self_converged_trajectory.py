@@ -104,14 +104,13 @@ class SelfConvergedTrajectory(ReferenceTrajectory):
     def describe_uncertainty(self, k: int) -> str:
         """Describe how well the motion is known at times[k], and why no better."""
         why = (
-            "the limits of implicit Euler and BDF2 differ: what an impact gives back, and what friction acts against, "
-            "depend on the integrator"
+            "the limits of implicit Euler and BDF2 differ, because impacts and friction depend on the integrator"
             if self.has_disagreement
             else f"halving the steps further takes more than {MAX_SECONDS:g} s"
         )
         return (
-            f"after {self.times[k]:.4g} s the self-converged motion is known to {self.disagreement[k]:.1e} of the "
-            f"displacement, by steps of {self.step:.2g} s; {why}"
+            f"after {self.times[k]:.4g} s the self-converged motion is accurate to {self.disagreement[k]:.1e} of the "
+            f"displacement, with steps of {self.step:.2g} s; {why}"
         )
 
     def require_accuracy(self, error: float) -> None:
@@ -119,7 +118,11 @@ class SelfConvergedTrajectory(ReferenceTrajectory):
         known = self.count_known_times(CONTACT_MARGIN * error)
         if known < len(self.times):
             least = float(self.disagreement[known]) / CONTACT_MARGIN
-            can = f"use an error of {least:.1g} or more, or a shorter horizon" if least < 1.0 else "none can be had"
+            can = (
+                f"use an error of {least:.1g} or more, or a shorter horizon"
+                if least < 1.0
+                else "no error can be measured"
+            )
             raise NotConverged(
                 f"contact has no certified reference, and an error of {error:.1e} cannot be measured: "
                 f"{self.describe_uncertainty(known)}; {can}"
@@ -219,7 +222,7 @@ def _compare_motions(
 
     moved = size(second.positions - second.start_positions)
     if not moved.all():
-        raise NotConverged("nothing moves, and errors are relative to what does")
+        raise NotConverged("nothing moves, and errors are relative to the displacement")
     halved = [size(now[name].positions - before[name].positions) for name in LIMIT_INTEGRATORS]
     extrapolated = 2.0 * first.positions - before[LIMIT_INTEGRATORS[0]].positions
     most = np.maximum(halved[1], size(extrapolated - second.positions)) / moved

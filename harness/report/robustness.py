@@ -212,7 +212,7 @@ def read_verified_runs(folder: Path) -> list[VerifiedRun]:
     if not any(row["stationarity"] is not None or row["reference_distance"] is not None for row in table):
         raise InputError(f"{folder}: contains no verified runs; run a sweep with `verify: true`")
     if any(row["stationarity"] is not None and row["stationarity_above_roundoff"] is None for row in table):
-        raise InputError(f"{folder}: contains runs that another version judged; run the sweep again")
+        raise InputError(f"{folder}: contains runs that another version of springbench verified; run the sweep again")
     firsts = [run[0] for run in runs.values()]
     of_scene: dict[str, list[Mapping[str, Any]]] = {}
     of_solver: dict[str, list[Mapping[str, Any]]] = {}

@@ -164,7 +164,7 @@ def limit_read_memory(units: Sequence[Path]) -> Generator[None]:
             yield
     except MemoryError as error:
         folder = units[0].parent if units else None
-        why = f"rows take more than {most / 2**30:.1f} GiB of memory to read; take out what is not yours"
+        why = f"reading the rows takes more than {most / 2**30:.1f} GiB of memory; remove files of other programs"
         raise InputError(InputMistake(why, folder)) from error
 
 

@@ -272,7 +272,7 @@ def _require_unique(spec: SceneSpec, parts: list[EffectContribution]) -> None:
     for i, part in enumerate(parts):
         for what in part.exclusive_features:
             if first.setdefault(what, i) != i:
-                problem = f"{what} is there already, as effects[{first[what]}]; the two would add up, so remove one"
+                problem = f"{what} repeats effects[{first[what]}], and the two would add up; remove one"
                 raise InputError(InputMistake(problem, key=f"effects[{i}]"))
 
 
@@ -323,17 +323,17 @@ def find_implausible_materials(effects: Sequence[SceneEffect], mesh: Mesh, mass:
 
 def _compute_vertex_masses(spec: SceneSpec, mesh: Mesh) -> NDArray[np.float64]:
     if spec.mass is not None and spec.mass_per_area is not None:
-        raise InputError(InputMistake("is given, and so is `mass`; leave out one of them", key="mass_per_area"))
+        raise InputError(InputMistake("cannot be combined with `mass`; leave out one of them", key="mass_per_area"))
     if spec.mass is not None:
         return spec.mass * mesh.mass_fractions
     if spec.mass_per_area is not None:
         if mesh.dimension != 2 or not len(mesh.triangles):
-            raise InputError(InputMistake("needs a surface, and this mesh is none; give `mass`", key="mass_per_area"))
+            raise InputError(InputMistake("needs a surface, and this mesh has none; give `mass`", key="mass_per_area"))
         return spec.mass_per_area * (
             lump_areas(mesh.rest_positions, mesh.triangles) if mesh.vertex_areas is None else mesh.vertex_areas
         )
     if mesh.mass is None:
-        raise InputError(InputMistake("is missing; this mesh brings no masses, so give the total [kg]", key="mass"))
+        raise InputError(InputMistake("is missing, and this mesh has no masses; give the total mass [kg]", key="mass"))
     return mesh.mass
 
 

@@ -250,7 +250,7 @@ def build_checked_contribution(
         made: Any = effect.build_contribution(mesh, mass, time_step)
     if [array.tobytes() for array in _list_arrays(mesh, mass)] != before:
         raise InputError(
-            f"{plugin}: `build_contribution` wrote to the mesh or the masses, which it was given; change copies"
+            f"{plugin}: `build_contribution` wrote to the mesh or the masses, which are inputs; change copies"
         )
     if not isinstance(made, EffectContribution):
         expected = "expected a springbench.harness.scenes.effects.effect_interface.EffectContribution"

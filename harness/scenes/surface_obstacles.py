@@ -162,7 +162,7 @@ class MeshObstacle(ConfigModel):
             mesh = self.mesh.build_mesh(self.size)
             points, triangles = mesh.rest_positions, mesh.triangles
         if not len(triangles):
-            raise InputError("the mesh has no triangles, so there is nothing to meet")
+            raise InputError("the mesh of the obstacle has no triangles; expected a surface")
         if self.frames:
             if len(points) != self.frames.frame_positions.shape[1]:
                 counts = f"{self.frames.frame_positions.shape[1]:,} points for a mesh of {len(points):,}"

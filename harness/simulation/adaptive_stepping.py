@@ -245,9 +245,9 @@ class _AdaptiveIntegration:
         scene, _ = self._ladder.prepare_level(self._level)
         method = scene.integrator
         if not isinstance(method, RungeKutta) or not method.embedded_order:
-            raise Unsupported("the integrator estimates no error of its steps")
+            raise Unsupported("the integrator has no error estimate; use an embedded one such as esdirk-4")
         if scene.velocity_filters:
-            raise Unsupported("a filter of the velocity acts once a step, and no error estimate includes it")
+            raise Unsupported("error estimates do not include velocity filters, and the scene has one")
         self._method, error_order = method, 1.0 + min(method.order, method.embedded_order)
         self._elementary = StepSizeController(error_order, min_factor=MIN_STEP_FACTOR)
         self._predictive = StepSizeController(error_order, beta_1=2.0, beta_2=-1.0, alpha=-1.0)

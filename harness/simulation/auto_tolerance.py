@@ -89,7 +89,7 @@ class LocalErrorStopRule:
         """
         if scene.alternate_scene:
             raise Unsupported(
-                "rtol: auto differences steps of one length, and the scene alternates two; give a number, such as "
+                "rtol: auto requires a constant step size, and the scene alternates two; give a number, such as "
                 "rtol: 1e-6"
             )
         system, order = scene.system, scene.integrator.order

@@ -108,7 +108,7 @@ class SolverContract:
         """Raise RunFailed if the system has been modified."""
         written = _find_differences(self._before, _collect_system_arrays(self._system))
         if written:
-            raise RunFailed(f"{line}: wrote to {', '.join(written)}, which it was given; copy what is to be changed")
+            raise RunFailed(f"{line}: wrote to {', '.join(written)}, which is an input; change a copy")
 
 
 class ContractCheckedSolver(DelegatingSolver):
@@ -135,7 +135,7 @@ class ContractCheckedSolver(DelegatingSolver):
         written = _find_differences(before, _collect_problem_arrays(problem))
         if written:
             line = self._locate_write(_restore_problem(problem, before), stop) or line
-            raise RunFailed(f"{line}: wrote to {', '.join(written)}, which it was given; copy what is to be changed")
+            raise RunFailed(f"{line}: wrote to {', '.join(written)}, which is an input; change a copy")
         self._contract.require_unmodified(line)
         if not isinstance(found, Solution):
             raise RunFailed(

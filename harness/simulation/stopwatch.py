@@ -193,5 +193,7 @@ def check_phases(prepared: PreparedSolver, problem: StepProblem) -> dict[str, Ca
             again = call()
             does = bool(np.isfinite(np.asarray(again)).any()) or not known or not len(problem.system.free_vertices)
         if not does:
-            raise RunFailed(f"the phase {phase} does nothing; it should compute, and return the array that it wrote")
+            raise RunFailed(
+                f"the phase {phase} does nothing; expected a call that computes and returns its output array"
+            )
     return phases

@@ -166,10 +166,14 @@ class AdaptiveSubstepper(_Substepper):
 
     def _prepare_pieces(self, setting: float) -> tuple[Scene, _SubsteppingSolver, int]:
         if changes := _list_time_dependence(self.scene):
-            raise Unsupported(f"takes {' and '.join(changes)} as even within a frame, which is of order 1")
+            raise Unsupported(
+                f"error estimates assume constant forces and pins within a frame; the scene has {' and '.join(changes)}"
+            )
         ready = self.solver.prepare(self.scene.system)
         if not isinstance(ready, AdaptiveSubstepping):
-            raise Unsupported("the method chooses no steps by an error")
+            raise Unsupported(
+                "the solver has no error estimate to select step sizes; expected a solver such as dormand-prince-8"
+            )
         return self.scene, ready.with_tolerance(setting), 1
 
 
@@ -194,11 +198,14 @@ class FixedSubstepper(_Substepper):
         scene = self.build_scene(self.scene.system.time_step / pieces) if pieces > 1 else self.scene
         ready = self.solver.prepare(scene.system)
         if not isinstance(ready, FixedSubstepping):
-            raise Unsupported("the number of its steps in a frame cannot be set")
+            raise Unsupported("the solver has no setting for the number of substeps in a frame")
         return scene, ready.with_refined_substeps(setting if pieces == 1 else 1.0), pieces
 
 
 def _list_time_dependence(scene: Scene) -> list[str]:
     """List the quantities that substepping solvers take as constant within a frame although they change."""
-    there = ("forces of place, speed and time", scene.varying_forces), ("moving pins", scene.pin_motions)
+    there = (
+        ("forces that depend on position, velocity or time", scene.varying_forces),
+        ("moving pins", scene.pin_motions),
+    )
     return [what for what, some in there if some]

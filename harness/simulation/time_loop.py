@@ -191,7 +191,9 @@ def prepare(scene: Scene, solver: Solver) -> PreparedSolver:
         scene.alternate_scene,
     )
     if history and alternate:
-        raise Unsupported("the integrator's formula is valid for steps of one length, and the scene alternates two")
+        raise Unsupported(
+            "the integrator requires a constant step size, and the scene alternates two; use implicit-euler"
+        )
     prepared, other = solver.prepare(scene.system), alternate.system if alternate else _build_first_system(scene)
     return AlternatingSolver(prepared, solver.prepare(other), other.velocity_rate) if history or alternate else prepared
 

@@ -63,7 +63,7 @@ def require_mass(system: System, anchor_stiffness: NDArray[np.float64], solver: 
         named = ", ".join(map(str, loose[:5])) + (", ..." if len(loose) > 5 else "")
         raise Unsupported(
             f"{solver}: moves each vertex by its own mass; {len(loose)} of {system.num_vertices} have none and are not "
-            f"pinned ({named}): give them mass, or take a solver that minimises"
+            f"pinned ({named}): give them mass, or use a solver such as numba"
         )
 
 
@@ -79,6 +79,6 @@ def require_implicit_euler(system: System, solver: str) -> None:
     """
     if system.inertia_factor != 1.0:
         raise Unsupported(
-            f"{solver}: divides the step itself and has its own velocity, which takes the place of an integrator; "
+            f"{solver}: divides the step itself and returns its own velocity, so that the integrator has no effect; "
             "use the integrator implicit-euler"
         )

@@ -162,7 +162,7 @@ def select_solver(
     """
     if linear not in get_args(LinearSolverName):
         raise Unsupported(
-            f"linear_solver: {linear!r} is not known; it is one of {', '.join(get_args(LinearSolverName))}"
+            f"linear_solver: {linear!r} is unknown; expected one of {', '.join(get_args(LinearSolverName))}"
         )
     if linear == "cholespy" and precision != "float64":
         raise Unsupported(f"linear_solver: cholespy supports float64 only, not {precision}; use supernodal")

@@ -148,5 +148,5 @@ def test_a_disk_that_is_full_on_one_worker_sends_its_runs_to_the_other(tmp_path:
     sweep = Sweep.create(tmp_path)
     with farm(tmp_path / "one", (FAR + FULL, FAR)) as found:
         said = sweep.finish_runs(found.address, {})
-    assert "is done elsewhere" in said
+    assert "is repeated by another worker" in said
     assert "File too large" in said

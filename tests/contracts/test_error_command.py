@@ -44,10 +44,10 @@ SCENES = Path(__file__).parents[2] / "configs" / "scenes"
         (("--error", "2"), "--error: got 2; expected a number between 0 and 1"),
         (("--error", "nan"), "--error: got nan"),
         (("--error", "1e-3", "--t-end", "-1"), "--t-end: got -1; expected seconds above 0"),
-        (("--error", "1e-3", "--solver", "newton"), "--solver: with --error, solver and steps are chosen"),
-        (("--error", "1e-3", "--integrator", "bdf2"), "--integrator: with --error"),
-        (("--t-end", "1"), "--t-end: is of a run with --error"),
-        (("--verify",), "--verify: is of a run with --error"),
+        (("--error", "1e-3", "--solver", "newton"), "--solver: cannot be combined with --error"),
+        (("--error", "1e-3", "--integrator", "bdf2"), "--integrator: cannot be combined with --error"),
+        (("--t-end", "1"), "--t-end: applies only to a run with --error"),
+        (("--verify",), "--verify: applies only to a run with --error"),
     ],
 )
 def test_an_impossible_request_is_the_users_mistake(options, message, tmp_path, capsys):

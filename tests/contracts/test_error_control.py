@@ -305,7 +305,7 @@ def test_candidate_methods_follow_from_the_properties_of_solvers_and_integrators
     ("effect", "what"),
     [
         (MOVING_PIN, "moving pins"),
-        (AirDragEffect(drag_law="quadratic", coefficient=0.5), "forces of place, speed and time"),
+        (AirDragEffect(drag_law="quadratic", coefficient=0.5), "forces that depend on position, velocity or time"),
     ],
 )
 def test_methods_that_would_lose_their_order_silently_are_named_with_the_reason(effect, what):
@@ -316,7 +316,7 @@ def test_methods_that_would_lose_their_order_silently_are_named_with_the_reason(
         OWN[:3], 1
     )
     assert {way.integrator for way in found} == {"substepping", "esdirk-4", "midpoint"}
-    assert [line.split(":")[0].removeprefix("  not by ") for line in messages] == OWN[3:]
+    assert [line.removeprefix("  unsupported: ").split(":")[0] for line in messages] == OWN[3:]
     assert all(what in line for line in messages)
 
 

@@ -104,7 +104,7 @@ def test_a_method_that_does_not_improve_is_followed_by_the_next(monkeypatch):
     answer = search_followers(monkeypatch, 1e-2, messages, stuck=stuck, slower=Formula(lambda steps: 1.0 / steps, 1e-2))
     assert answer.best_trial.method.solver != "stuck"
     assert answer.best_trial.error_estimated <= 1e-2
-    assert any(line.startswith("  stuck: reaches 3.") and "come no nearer" in line for line in messages)
+    assert any(line.startswith("  stuck: reaches an error of 3.") and "do not reduce" in line for line in messages)
 
 
 def test_a_method_that_takes_longer_than_predicted_for_the_next_is_tried_after_it(monkeypatch):
@@ -129,7 +129,7 @@ def test_an_error_that_no_method_reaches_is_refused_with_the_nearest(monkeypatch
         "springbench.harness.experiments.error_control.method_search._MethodSearch._find_reference_trial",
         lambda *_: _build_exact_trial(),
     )
-    with pytest.raises(RunFailed, match=r"no step size reaches an error of 0.01: b was nearest with 0\.3"):
+    with pytest.raises(RunFailed, match=r"no step size reaches an error of 0.01: b was closest with 0\.3"):
         search_cheapest_method(
             ErrorTarget.from_scene(SPRING, 2, 0.2), 1e-2, estimate_growth(SPRING, 2, 0.2), lambda line: None
         )

@@ -193,4 +193,7 @@ def test_a_run_whose_second_pass_differs_from_the_timed_one_fails(execute_busy_r
     monkeypatch.setattr(SingleStageIntegrator, "complete_step", drifting)
     (row,), _ = execute_busy_run()
     assert row["status"] == "failed"
-    assert row["reason"] == "the recorded pass ended at other positions than the timed pass"
+    assert (
+        row["reason"]
+        == "the final positions of the recorded pass differ from those of the timed pass; expected equal bits"
+    )

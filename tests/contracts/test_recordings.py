@@ -244,7 +244,7 @@ def test_a_small_recording_is_small(tmp_path: Path):
 def test_a_recording_of_another_layout_is_refused_in_words(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("springbench.harness.recording.rerun_recorder.LAYOUT_VERSION", LAYOUT_VERSION - 1)
     path = write_recording(tmp_path / "a.rrd")
-    with pytest.raises(InputError, match=r"laid out as another version .* do its run again, with --rerun"):
+    with pytest.raises(InputError, match=r"layout of another version .* repeat its run with --rerun"):
         read_replay(path)
 
 

@@ -121,7 +121,7 @@ def test_a_process_that_packs_a_folder_has_exclusive_access(tmp_path: Path, monk
         pass
     with (
         folder_locks.lock_folder_exclusive(tmp_path),
-        pytest.raises(InputError, match="has it for itself"),
+        pytest.raises(InputError, match="has locked it exclusively"),
         folder_locks.lock_folder_shared(tmp_path),
     ):
         pass

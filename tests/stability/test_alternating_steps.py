@@ -59,7 +59,7 @@ def test_midpoint_falls_exactly_as_a_stone_does_whatever_the_steps():
 
 
 def test_an_integrator_of_two_steps_of_one_length_is_refused():
-    with pytest.raises(Unsupported, match="steps of one length"):
+    with pytest.raises(Unsupported, match="constant step size"):
         prepare(build_alternating_scene("bdf2"), NewtonSolver())
 
 

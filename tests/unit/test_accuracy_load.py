@@ -115,7 +115,7 @@ MISTAKES = [
     ("t_end: 0.5", "t_end: 0.51", 7, "is no multiple of the time step 0.0333333 s"),
     ("t_end: 0.5", "t_end: 0", 7, "greater than 0"),
     ("rounds: 7", "time_limit: -1", 5, "greater than 0"),
-    ("rounds: 7", "initial_guess: [coarse-to-fine]", 5, "this one is a solve itself"),
+    ("rounds: 7", "initial_guess: [coarse-to-fine]", 5, "which here is a solve"),
     ("cloth.yaml, ", "clod.yaml, ", 2, "there is no file"),
     ("{name: newton}", "{name: newton, order: 2}", 3, "unknown key"),
 ]

@@ -109,7 +109,7 @@ def test_a_sweep_meets_an_error_and_its_rows_state_the_cost(folder: Path) -> Non
         app, ["run", str(folder / "sweep.yaml"), "--in-process", "--results", str(folder / "results")]
     )
     assert done.exit_code == 1, done.output
-    assert "xpbd: estimates no error of a step" in done.output
+    assert "xpbd: has no error estimate" in done.output
     (file,) = (folder / "results" / "sweep" / "rows").glob("*-dormand-prince-8-*.parquet")
     found = [row for row in parquet_rows.read_rows([file]).to_pylist() if row["phase"] == "step"]
     assert [row["frame"] for row in found] == [1, 2, 3, 4]

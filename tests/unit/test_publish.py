@@ -113,7 +113,7 @@ def test_an_archive_that_was_changed_is_named_and_none_of_it_is_run(home: Path, 
     assert result.exit_code == 1
     for line in ("sweep.yaml: refuted (was changed)", "mine.py: refuted (was not", "(missing)"):
         assert line in result.output
-    assert "done again" not in result.output
+    assert "repeating" not in result.output
 
 
 @pytest.fixture(scope="module")
@@ -252,7 +252,7 @@ def test_runs_that_no_config_requests_cannot_be_decided(home: Path, tmp_path: Pa
     )
     assert "1 of 3 runs of sweep: undecided (the config expands to no such run)" in result.output
     assert result.exit_code == (1 if "refuted" in result.output else 3), result.output
-    assert "no repeat confirms these columns: " in result.output
+    assert "columns that a repeated run cannot confirm: " in result.output
 
 
 def test_false_rows_with_valid_checksums_are_refuted(home: Path, tmp_path: Path):
@@ -276,7 +276,7 @@ def test_an_archive_whose_results_lead_to_another_config_is_refused(home: Path, 
         content["results/sweep/.config"] = str(home / "sweep.yaml").encode()
 
     result = command("verify-archive", change_archive(home / "x.zip", tmp_path / "y.zip", change, sums=True))
-    assert (result.exit_code, "leads out of the archive" in result.output) == (2, True)
+    assert (result.exit_code, "points to a file outside of the archive" in result.output) == (2, True)
 
 
 BAD: dict[str, Callable[[Path], object]] = {

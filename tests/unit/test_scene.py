@@ -45,7 +45,7 @@ def test_a_woven_cloth_of_a_mass_per_area_weighs_that_and_the_reference_terms_ag
     assert verify_terms(spec, made, "implicit-euler") == "agrees"
     for mesh, more, message in (
         (ChainMesh(), {}, "needs a surface"),
-        (SkirtMesh(), {"mass": 1.0}, "is given, and so is `mass`"),
+        (SkirtMesh(), {"mass": 1.0}, "cannot be combined with `mass`"),
     ):
         with pytest.raises(InputError, match=message):
             build_scene(SceneSpec.model_validate({"mesh": mesh, **given, **more}), 8)
@@ -84,7 +84,7 @@ def test_springs_of_several_effects_are_all_the_springs():
 
 
 def test_gravity_twice_is_refused_with_both_places():
-    with pytest.raises(InputError, match=r"effects\[2\]: gravity is there already, as effects\[0\]"):
+    with pytest.raises(InputError, match=r"effects\[2\]: gravity repeats effects\[0\]"):
         build_test_scene(
             ChainMesh(),
             GravityEffect(),

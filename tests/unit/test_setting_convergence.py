@@ -236,7 +236,7 @@ def test_without_a_reference_settings_are_compared_with_the_finest(scene: Path, 
 
     monkeypatch.setattr(ReferenceStore, "load_trajectory", refuse)
     found = study(scene)
-    assert found.reference == "the finest setting, 4 x 8, for there is no reference"
+    assert found.reference == "the finest setting, 4 x 8, because there is no reference"
     assert found.find_result(StepSetting(4, 8)).error == inf
     assert "energy" not in found.describe_verdict()[1]
 

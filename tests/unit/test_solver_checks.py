@@ -62,9 +62,9 @@ class Wrong(NamedTuple):
 
 NOTHING = "return Solution(problem.initial_guess.copy(), 1, 0.0, 0.0, 'tolerance')"
 WRONG = {
-    "does nothing and says that nothing is left": Wrong(NOTHING, "", "Mine: reports a residual of 0 J^(1/2), where"),
+    "does nothing and says that nothing is left": Wrong(NOTHING, "", "Mine: reports a residual of 0 J^(1/2); expected"),
     "says that it reached the tolerance": Wrong(
-        "return replace(found, termination_reason='converged')", "", "says that it reached the tolerance, where"
+        "return replace(found, termination_reason='converged')", "", "and the reason `converged`; expected"
     ),
     "says a residual that is too small": Wrong("return replace(found, residual=found.residual / 100)", "", "reports a"),
     "says no residual": Wrong("return replace(found, residual=float('nan'))", "", "reports a residual of nan"),

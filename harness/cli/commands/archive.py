@@ -114,26 +114,26 @@ def verify_one_archive(archive: Path, seed: int | None, *, with_user_code: bool)
         if wrong := checks.verify_checksums(folder):
             for claim in wrong:
                 print_message(str(claim))
-            print_message(f"{archive} is not what was published; nothing of it was run")
+            print_message(f"{archive} differs from its checksums; no run was repeated")
             return 1
         print_message("all checksums match")
         found, claims = checks.load_published_runs(folder, print_message, with_user_code=with_user_code)
         runs = checks.select_runnable(found, print_message)
         chance = randbelow(10**6) if seed is None else seed
         taken = checks.sample_runs(runs, chance)
-        print_message(f"{len(taken)} of {len(runs)} runs are done again (--seed {chance})")
+        print_message(f"repeating {len(taken)} of {len(runs)} runs (--seed {chance})")
         claims += checks.verify_reruns(
             taken, checks.rerun_published(taken, Path(scratch), create_display(get_error_console()))
         )
     for claim in claims:
         print_message(str(claim))
-    print_message(f"no repeat confirms these columns: {', '.join(sorted(checks.IRREPRODUCIBLE_COLUMNS))}")
+    print_message(f"columns that a repeated run cannot confirm: {', '.join(sorted(checks.IRREPRODUCIBLE_COLUMNS))}")
     states = {claim.verdict for claim in claims}
     bad, unknown = checks.ClaimVerdict.FAIL in states, checks.ClaimVerdict.INCONCLUSIVE in states or not claims
     print_message(
         "a claim is refuted"
         if bad
-        else "not all can be decided here"
+        else "some claims cannot be decided on this machine"
         if unknown
         else "all repeated runs confirm the claims"
     )

@@ -125,7 +125,7 @@ def _execute_error_control(
     print_message: PrintMessage,
 ) -> bool:
     error = request.error
-    print_message("estimating how far ahead the motion can be predicted")
+    print_message("estimating the time up to which the motion is predictable")
     error_target = ErrorTarget.from_scene(scene, request.size, request.t_end)
     folder = claim_folder(results / config.stem, config)
     with machine_info.limit_threads(1):
@@ -140,14 +140,15 @@ def _execute_error_control(
             answer = _search_method(error_target, error, seen, [] if request.rerun else before, print_message)
     path, best = answer.best_trial.trajectory, answer.best_trial
     print_message(
-        f"requested {error:g}, estimated {best.error_estimated:.1g}, {path.cpu_seconds:.3g} s of processor time"
+        f"requested error {error:g}, estimated error {best.error_estimated:.1g}, "
+        f"processor time {path.cpu_seconds:.3g} s"
     )
     factors = f", {path.num_factorisations} factorisations" if path.num_factorisations else ""
     print_message(
-        f"by {best.method}: {path.num_accepted_steps} steps, {path.num_rejected_steps} rejected{factors}"
-        + (f"; more accurate than requested, for {answer.note}" if answer.note else "")
+        f"{best.method}: {path.num_accepted_steps} accepted steps, {path.num_rejected_steps} rejected{factors}"
+        + (f"; more accurate than requested, because {answer.note}" if answer.note else "")
     )
-    print_message(f"choosing, and a closer motion for the estimate, took {answer.search_seconds:.3g} s besides")
+    print_message(f"search and error estimate took {answer.search_seconds:.3g} s in addition")
     motion_scene = error_target.build_scene(error_target.frame_seconds, "substepping")
     status = answer.build_status_columns(answer.compute_balances(motion_scene))
     if status["status"] != "ok":
@@ -225,12 +226,12 @@ def _search_method(
         return search_cheapest_method(error_target, error, growth, print_message)
     names = ", ".join(format_method_name(integrator, solver.name) for integrator, solver in pairs)
     print_message(
-        f"worth trying by rows measured before, for an error of {nearest:g}: {names}; --rerun tries all methods"
+        f"trying the cheapest methods of stored results for an error of {nearest:g}: {names}; --rerun tries all"
     )
     try:
         return search_cheapest_method(error_target, error, growth, print_message, pairs)
     except RunFailed as failed:
-        print_message(f"{failed}; so all methods are tried")
+        print_message(f"{failed}; trying all methods")
         return search_cheapest_method(error_target, error, growth, print_message)
 
 
@@ -248,19 +249,20 @@ def _verify_error(
             error_target.scene, error_target.size, [error_target.t_end], error=error
         )
     except RunFailed as failed:
-        print_message(f"the reference cannot grade it: {failed}")
+        print_message(f"the error cannot be measured, because there is no reference: {failed}")
         return None
     measured = trajectory.measure_error(-1, p)
-    print_message(
-        f"by the reference its error is {measured:.2g}, {'within' if measured <= error else 'above'} that requested"
-    )
+    print_message(f"measured error {measured:.2g}, {'within' if measured <= error else 'above'} the requested error")
     return measured
 
 
 def _check_options(error: float, t_end: float | None, rejected_options: Mapping[str, Any]) -> None:
     """Raise InputError for invalid options."""
     mistakes = [
-        InputMistake("with --error, solver and steps are chosen; leave it out", key=f"--{name.replace('_', '-')}")
+        InputMistake(
+            "cannot be combined with --error, which selects solver and steps; leave it out",
+            key=f"--{name.replace('_', '-')}",
+        )
         for name, value in rejected_options.items()
         if value
     ]
@@ -317,9 +319,9 @@ def _build_third_party_rows(
 
     shared = {name: row[name] for name in _SHARED_COLUMNS} | build_provenance_columns()
     found = list[dict[str, Any]]()
-    print_message("third-party integrators, in the same process, to the same error:")
+    print_message("third-party integrators in the same process, at the same error:")
     for other in compare_third_party(error_target, error, search_result):
-        comparison = f"{other.cpu_time_ratio:.3g} times the processor time, an error of {other.error_estimated:.1g}"
+        comparison = f"{other.cpu_time_ratio:.3g} times the processor time, estimated error {other.error_estimated:.1g}"
         print_message(f"  {other.name}: {other.reason or comparison}")
         became = {"status": "failed", "reason": other.reason} if other.reason else {"status": "ok"}
         times = (

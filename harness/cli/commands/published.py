@@ -50,7 +50,7 @@ def publish_study(
         raise InputError(InputMistake("does not state its config; give --config", results[0]))
     for path in (*results, provenance):
         if path and not path.exists():
-            raise InputError(InputMistake("is not there; expected results, or a Parquet file of measurements", path))
+            raise InputError(InputMistake("does not exist; expected results, or a Parquet file of measurements", path))
     write_study(results, owner, published, print_message, provenance)
 
 
@@ -83,7 +83,7 @@ def reproduce(
     from secrets import randbelow
 
     if seed is not None and not quick and study != ENTRIES:
-        raise InputError(InputMistake("draws the runs of --quick; give both", key="--seed"))
+        raise InputError(InputMistake("applies only with --quick; give both", key="--seed"))
     if study == ENTRIES:
         raise typer.Exit(_verify_entries(published / ENTRIES, seed))
     found = published_set.list_studies(published) if study == ALL_STUDIES else ()

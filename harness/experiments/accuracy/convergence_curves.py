@@ -244,6 +244,6 @@ def _time_iterates(
         gc.enable()
     p = copied() if copied else p
     if not np.array_equal(p, expected, equal_nan=True):
-        raise RunFailed("a timed pass ended at other positions than the graded one")
+        raise RunFailed("the final positions of a timed pass differ from those of the graded pass; expected equal bits")
     stamps[1:] -= began
     return stamps, watch.build_columns("iterates", np.diff(stamps))["preempted"]

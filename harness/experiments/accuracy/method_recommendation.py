@@ -218,7 +218,7 @@ def recommend_method(
     if goal.max_error and reference_error:
         goal = replace(goal, max_error=goal.max_error - reference_error)
         print_message(
-            f"the reference itself errs by up to {reference_error:.1e}: against it, {goal.max_error:.3g} is allowed"
+            f"the reference has an error of up to {reference_error:.1e}; against it, {goal.max_error:.3g} is allowed"
         )
     t_end, frame = study.work[0].t_end, scene.time_step
 
@@ -265,7 +265,7 @@ def _plan_study(
         InputError: the scene or a candidate is invalid.
         RunFailed: the motion has no reference.
     """
-    print_message("estimating how far ahead the motion can be predicted")
+    print_message("estimating the time up to which the motion is predictable")
     t_end, time_limit = options.t_end, options.time_limit
     if t_end is not None:
         _build_valid_study(path, scene, size, candidates, t_end, time_limit)
@@ -313,7 +313,7 @@ def _find_contact_t_end(
     longest = min(DEFAULT_T_END, scene.frames * scene.time_step)
     motion, reason = reference_store.load_contact_horizon(scene, size, longest, error=max_error)
     if reason:
-        print_message(f"an error of {max_error:g} can be measured up to {motion.times[-1]:.4g} s, for {reason}")
+        print_message(f"an error of {max_error:g} can be measured up to {motion.times[-1]:.4g} s, because {reason}")
     return float(motion.times[-1])
 
 
@@ -356,7 +356,7 @@ def find_default_t_end(
         seen.require_predictable(max_error)
     print_message(
         f"{path.stem} {size or ''}: an error of {max_error:g} can be measured "
-        f"up to {longest:g} s, for a perturbation of "
+        f"up to {longest:g} s, because a perturbation of "
         f"1e-12 of the size grows to {seen.growth_factor[-1]:.1e} of the displacement after {DEFAULT_T_END:g} s"
     )
     return longest
@@ -371,7 +371,7 @@ def _compute_reference(
     print_message: Callable[[str], None],
 ) -> ReferenceTrajectory:
     """Compute the reference trajectory and report progress. Raises RunFailed if there is none."""
-    print_message(f"the reference first, the motion up to {t_end:g} s, which is made once")
+    print_message(f"computing the reference motion up to {t_end:g} s, once")
     last = [monotonic()]
 
     def report_progress(motion: int, time: float) -> None:
@@ -552,7 +552,7 @@ def _check_method(
     print_message(f"checking {best}")
     row = build_work_rows(best.work_spec, load_reference_trajectory(best.work_spec, reference_store), lambda: None)[0]
     if not is_measured(row):
-        raise RunFailed(f"the check of {best} ended otherwise than before: {row['status']}: {row['reason']}")
+        raise RunFailed(f"the repeated measurement of {best} failed: {row['status']}: {row['reason']}")
     return _build_measured_method(best.work_spec, row, reference_error)
 
 

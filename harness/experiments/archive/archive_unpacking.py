@@ -24,7 +24,7 @@ def unpack_archive(archive: Path) -> Generator[Path]:
     expected = "expected an archive that `springbench publish` wrote (.zip)"
     if not archive.is_file():  # a device or a pipe would be read for ever
         raise InputError(
-            InputMistake(f"is {'no plain file' if archive.exists() else 'not there'}; {expected}", archive)
+            InputMistake(f"{'is no plain file' if archive.exists() else 'does not exist'}; {expected}", archive)
         )
     with TemporaryDirectory() as scratch:
         try:

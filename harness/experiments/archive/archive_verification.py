@@ -188,7 +188,9 @@ def load_published_runs(
     for sweep in list_sweep_folders(folder / "results"):
         config = read_owner(sweep)
         if config and not config.is_relative_to(folder.resolve()):
-            raise InputError(InputMistake("leads out of the archive; nothing of it was run", sweep / ".config"))
+            raise InputError(
+                InputMistake("points to a file outside of the archive; no run was repeated", sweep / ".config")
+            )
         by_run: dict[str, list[ResultRow]] = defaultdict(list)
         for row in _read_rows(sweep):
             by_run[row["run_id"]].append(row)
@@ -206,11 +208,13 @@ def load_published_runs(
         repeated = [one for one in found if all(row["status"] in _REPRODUCIBLE_STATUSES for row in one.rows)]
         if left := len(found) - len(repeated):
             print_message(
-                f"{sweep.name}: {left} runs failed, which depends on more than their config: they are not done again"
+                f"{sweep.name}: {left} failed runs are not repeated, because failures depend on more than the config"
             )
         safe = [one for one in repeated if with_user_code or not one.run.find_plugins()]
         if left := len(repeated) - len(safe):
-            print_message(f"{sweep.name}: {left} runs need code from the archive: read it, then give --with-user-code")
+            print_message(
+                f"{sweep.name}: {left} runs need code from the archive; review it, then give --with-user-code"
+            )
         runs += safe
     return runs, claims
 
@@ -532,5 +536,7 @@ def select_runnable(runs: Sequence[PublishedRun], print_message: Callable[[str],
     usable = machine_info.describe_machine().cores
     found = [one for one in runs if machine_info.choose_threads(one.run.threads).count <= usable]
     if left := len(runs) - len(found):
-        print_message(f"{left} of {len(runs)} runs need more cores than this machine has: they are not done again")
+        print_message(
+            f"{left} of {len(runs)} runs are not repeated, because they need more cores than this machine has"
+        )
     return found

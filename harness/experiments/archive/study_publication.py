@@ -69,7 +69,7 @@ def write_study(
         InputError: there are no rows, runs of several configs, or the published set would become too large.
     """
     if not config.is_file():
-        raise InputError(InputMistake("is not there; expected the config of these results", config, key="--config"))
+        raise InputError(InputMistake("does not exist; expected the config of these results", config, key="--config"))
     by_part = [_read_part(part) for part in parts]
     made = _read_measurements(provenance) if provenance else None
     found = {

@@ -156,7 +156,7 @@ def list_methods_of_solver(solver: SolverSpec) -> list[tuple[str, SolverSpec]]:
     if one.is_substepping:
         return [("substepping", solver)]
     if not is_minimiser(load_target(SOLVER_TABLE[solver.name])):
-        raise Unsupported(f"{solver.name}: estimates no error of a step and does not minimise those of an integrator")
+        raise Unsupported(f"{solver.name}: has no error estimate and does not minimise the objective of an integrator")
     return [(name, solver) for name, one in INTEGRATORS.items() if isinstance(one, RungeKutta) and one.embedded_order]
 
 
@@ -167,7 +167,7 @@ def list_contact_methods_of_solver(solver: SolverSpec) -> list[tuple[str, Solver
         Unsupported: the solver does not minimise the steps of an integrator.
     """
     if not is_minimiser(load_target(SOLVER_TABLE[solver.name])):
-        raise Unsupported(f"{solver.name}: does not minimise steps, which error control with contact needs")
+        raise Unsupported(f"{solver.name}: does not minimise an objective, which error control with contact requires")
     return [(name, solver) for name in LIMIT_INTEGRATORS]
 
 
@@ -194,7 +194,7 @@ def prepare_candidate_methods(
             found.append(method)
         except (Unsupported, NotPositiveDefinite) as error:
             reasons.append(f"{method}: {str(error).removeprefix(f'{solver.name}: ')}")
-            print_message(f"  not by {reasons[-1]}")
+            print_message(f"  unsupported: {reasons[-1]}")
     if not found:
         raise RunFailed(f"no method with error control supports this scene: {'; '.join(reasons)}")
     return found

@@ -131,7 +131,7 @@ def run_error_controlled(run: RunSpec, error: float, tick: ProgressCallback, res
     for _ in range(run.rounds):
         rounds.append(best.rerun_trial())
         if not np.array_equal(rounds[-1].positions, best.trajectory.positions):
-            raise RunFailed("a round ended at other positions than the one before")
+            raise RunFailed("the positions of a round differ from those of the first; expected equal bits")
         for _ in range(run.frames):
             tick("timed pass")
     return ErrorControlledRun(

@@ -93,7 +93,7 @@ def compute_predictability_horizon(
     print_message(
         f"a perturbation of 1e-12 of the size grows to {seen.growth_factor[-1]:.1e} of the displacement after "
         f"{error_target.t_end:g} s: an error of {max_error:g} can be reached "
-        f"there, of {seen.min_error:.0e} at the least"
+        f"there, and of at least {seen.min_error:.0e}"
     )
     return seen
 
@@ -148,7 +148,7 @@ def search_cheapest_contact_method(
     reference = open_reference_store(results).require_contact_horizon(
         error_target.scene, error_target.size, error_target.t_end, error=max_error
     )
-    print_message(f"the reference itself errs by up to {reference.get_error_bound(-1):.1e}, which counts")
+    print_message(f"the reference has an error of up to {reference.get_error_bound(-1):.1e}, which estimates include")
     growth = PerturbationGrowth.from_reference(reference)
     return search_cheapest_method(error_target, max_error, growth, report_trial, candidates, reference)
 
@@ -248,7 +248,7 @@ class _MethodSearch:
         if not found:
             raise self._underflows[0]
         for method, given in late.items():
-            self._print_message(f"  {method}: given up after {given:.3g} s, for it is slower than others")
+            self._print_message(f"  {method}: stopped after {given:.3g} s, because it is slower than others")
         return found
 
     def _adopt_reference(self, reference: ReferenceTrajectory) -> Trial:
@@ -372,7 +372,8 @@ class _MethodSearch:
                     if found.error_estimated > self._max_error:
                         nearest.append(found)
                         self._print_message(
-                            f"  {trial.method}: reaches {found.error_estimated:.1e}, and shorter steps come no nearer"
+                            f"  {trial.method}: reaches an error of {found.error_estimated:.1e}, "
+                            "which shorter steps do not reduce"
                         )
                     return TrialOutcome(found.error_estimated, found.trajectory.cpu_seconds, result=found)
                 self._print_message(f"  {trial.method}: takes more than {limit:.3g} s")
@@ -458,8 +459,8 @@ class _MethodSearch:
             else f" with {nearest.trajectory.num_accepted_steps} steps"
         )
         return RunFailed(
-            f"no step size reaches an error of {self._max_error:g}: {nearest.method} was nearest with "
-            f"{nearest.error_estimated:.1g}{at}, and shorter ones come no nearer; "
+            f"no step size reaches an error of {self._max_error:g}: {nearest.method} was closest with "
+            f"{nearest.error_estimated:.1g}{at}, which shorter steps do not reduce; "
             "use a larger --error or a shorter "
             "--t-end"
         )

@@ -131,7 +131,7 @@ class SceneGrader:
             terms = collect_spring_terms(self.scene)
             self._finder = FingerprintFinder(self.scene, terms, request.required_iterations)
         except InputError as error:
-            self._finder_note = f"mistakes are not looked for: {error.mistakes[0].problem.partition('; leave out')[0]}"
+            self._finder_note = f"mistakes cannot be found: {error.mistakes[0].problem.partition('; leave out')[0]}"
 
     def grade_file(self, path: Path, report_progress: ProgressCallback = lambda line: None) -> PositionGrade:
         """Read and grade a submission.

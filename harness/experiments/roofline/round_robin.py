@@ -170,7 +170,9 @@ def _compare_positions(rows: dict[BenchmarkCandidate, list[ResultRow]], alive: l
             apart = float(np.abs(p - reference).max()) / float(np.ptp(reference, axis=0).max())
             limit = POSITION_RTOL[candidate.run.solver.parameters.get("precision", "float64")]
             if not apart <= limit:
-                raise RunFailed(f"its positions lie {apart:.1e} of the scene's size from the others'; expected {limit}")
+                raise RunFailed(
+                    f"positions differ from the others' by {apart:.1e} of the scene's size; expected at most {limit}"
+                )
             for row in rows[candidate]:
                 if row["phase"] == "step":
                     row["positions_digest"] = hash_positions(p)

@@ -141,7 +141,7 @@ class _PageFields:
     def _add_panels(self, name: str, alt: str, title: str, panels: Sequence[FigurePanel], width: float) -> str:
         path = self.page.parent / PICTURE_FOLDER / f"{name}.png"
         if any(picture.path == path for picture in self.pictures):
-            raise InputError(f"the picture {name} is there twice; give each a name of its own")
+            raise InputError(f"the picture name {name} is used twice; rename one of them")
         options = FigureOptions(width_mm=width, formats=("png",), font_size=9.0)
         digest = digest_panels(panels, title, width)
         self.pictures.append(PagePicture(path, digest, lambda: _draw_panels(panels, title, options)))

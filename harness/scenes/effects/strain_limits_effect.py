@@ -45,7 +45,7 @@ class StrainLimitsEffect(ConfigModel):
     @model_validator(mode="after")
     def _check_limits(self) -> "StrainLimitsEffect":
         if self.min_stretch == self.max_stretch:
-            raise ValueError("leave no length but one; use springs")
+            raise ValueError("`min_stretch` and `max_stretch` should differ; use springs for a fixed length")
         return self
 
     def build_contribution(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> EffectContribution:

@@ -126,7 +126,7 @@ class FileMesh(SpringValueKeys):
     @model_validator(mode="after")
     def _check_scale(self) -> FileMesh:
         if self.units and "scale" in self.model_fields_set:
-            raise ValueError("`units` and `scale` say the same; leave out one of them")
+            raise ValueError("`units` and `scale` cannot be combined; leave out one of them")
         return self
 
 

@@ -104,7 +104,7 @@ class PreparedSubstepping:
             Unsupported: if the substeps have a fixed size.
         """
         if not self.substep_choice.tolerance:
-            raise Unsupported("the method chooses no steps by an error")
+            raise Unsupported("the solver has a fixed number of substeps; expected one with `error_tolerance`")
         return replace(self, substep_choice=replace(self.substep_choice, tolerance=tolerance))
 
     def with_refined_substeps(self, refinement_factor: float) -> Self:

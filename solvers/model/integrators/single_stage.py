@@ -111,8 +111,8 @@ class SubsteppingIntegrator(SingleStageIntegrator):
         """
         if solution.velocity is None:
             raise Unsupported(
-                "the integrator `substepping` leaves it to the solver to integrate a step, and this one minimises what "
-                "another integrator states: take that one, or a solver such as dormand-prince-8"
+                "the integrator `substepping` requires a solver that integrates a step itself, such as "
+                "dormand-prince-8; this one minimises an objective: use an integrator such as implicit-euler"
             )
         return Motion(solution.positions, solution.velocity)
 
