@@ -88,6 +88,27 @@ def test_sections_have_one_form() -> None:
     ]
 
 
+REFERENCE = re.compile(r"\AThe same\b|\b[Ss]ee `")
+
+
+def find_references(tree: ast.Module) -> list[str]:
+    """Return the docstrings, of attributes too, that refer to another place instead of describing."""
+    texts = (
+        node.value for node in ast.walk(tree) if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)
+    )
+    return [text.value for text in texts if isinstance(text.value, str) and REFERENCE.search(text.value)]
+
+
+def test_docstrings_describe_and_do_not_refer() -> None:
+    found = {one.path.name: find_references(one.tree) for one in parse_sources()}
+    assert not {name: texts for name, texts in found.items() if texts}, "write in a few words what it is"
+
+
+def test_a_reference_in_place_of_a_description_is_found() -> None:
+    source = '"""Rows."""\nA = 1\n"""The same of columns."""\ndef add_rows(x):\n    """Add x, see `g`."""\n'
+    assert find_references(ast.parse(source)) == ["The same of columns.", "Add x, see `g`."]
+
+
 MAX_SUMMARY_WORDS = 15
 
 

@@ -1,4 +1,4 @@
-"""A public name has one meaning, and no file uses two classes of one name."""
+"""A public name has one meaning, no file uses two classes of one name, and a function is no participle."""
 
 import ast
 import re
@@ -85,6 +85,33 @@ def test_a_clash_is_found_under_another_name_too() -> None:
         find_class_clashes(parse_modules([*texts, ("a.v", "from a.x import Step as Energy\nfrom a.y import Step")]))
         == []
     )
+
+
+PARTICIPLE = re.compile(
+    "_*([a-z]+(ed|en|wn)|begun|bound|brought|built|chosen|done|found|gone|held|kept|left|lost|made|sent|swept|taken)_*"
+)
+VERBS = {
+    "codegen": "a property that Numba prescribes",
+    "_shorten": "a verb that ends in en",
+}
+"""Names of functions that end as a past participle does, and why."""
+
+
+def find_participles(tree: ast.Module) -> set[str]:
+    """Return the functions and methods, however deep, whose name is a past participle alone."""
+    names = {node.name for node in ast.walk(tree) if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)}
+    return {name for name in names if PARTICIPLE.fullmatch(name)}
+
+
+def test_no_function_is_named_by_a_past_participle_alone() -> None:
+    found = {name for tree in name_product_trees().values() for name in find_participles(tree)}
+    assert found - set(VERBS) == set(), "name it by a verb and an object, or as a noun"
+    assert set(VERBS) - found == set(), "these are no longer defined"
+
+
+def test_a_past_participle_is_found_within_functions_and_classes() -> None:
+    source = "class A:\n    def _shifted(self):\n        def drawn(): ...\ndef shift_pins(): ...\ndef read(): ...\n"
+    assert find_participles(ast.parse(source)) == {"_shifted", "drawn"}
 
 
 def find_unresolved(text: str, root: Path) -> set[str]:

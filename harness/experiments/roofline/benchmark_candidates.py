@@ -180,7 +180,7 @@ class CppCandidate:
             return self._process.close() if self._process else None
         finally:
             if self._process:
-                self._process.kill()
+                self._process.kill_process()
             self._folder.cleanup()
 
 

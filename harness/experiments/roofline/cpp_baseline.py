@@ -101,7 +101,7 @@ class CppBaseline:
         self._positions.unlink()
         return p
 
-    def kill(self) -> None:
+    def kill_process(self) -> None:
         """Kill the program in any state."""
         self._process.kill()
         self._process.wait()
