@@ -126,13 +126,13 @@ def execute_unclaimed(
     while todo:
         left: list[F] = []
 
-        def another(unit: F, left: list[F] = left) -> str:
+        def claim_unit(unit: F, left: list[F] = left) -> str:
             why = claims.try_claim(unit.rows_path)
             if why == CLAIMED_ELSEWHERE:
                 left.append(unit)
             return why
 
-        execute_batch(todo, another)
+        execute_batch(todo, claim_unit)
         waits = f"waiting for other commands, which have {len(left)} of these at hand"
         claims.wait_for_any([unit.rows_path for unit in left], partial(remarks, waits))
         todo = left

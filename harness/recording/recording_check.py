@@ -134,8 +134,8 @@ def _has_strain_colours(colours: NDArray[np.uint32], info: RecordingInfo, p: Pos
     known = {int(colour): level for level, colour in enumerate(build_palette()[:NUM_LEVELS].view(">u4").ravel())}
     recorded = np.array([known.get(int(colour), -NUM_LEVELS) for colour in colours])
 
-    def near(largest: NDArray[np.float64], other: NDArray[np.float64]) -> NDArray[np.bool_]:
+    def is_near(largest: NDArray[np.float64], other: NDArray[np.float64]) -> NDArray[np.bool_]:
         level = np.rint((np.clip(largest / info.strain_range, -1, 1) + 1) * (NUM_LEVELS - 1) / 2)
         return (np.abs(recorded - level) <= 1) & (np.abs(largest) >= (1.0 - ROUNDING_RTOL) * np.abs(other))
 
-    return bool((near(high, low) | near(low, high)).all())
+    return bool((is_near(high, low) | is_near(low, high)).all())

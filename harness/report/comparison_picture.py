@@ -150,11 +150,11 @@ def _choose_grid(panels: int, tiles: int, aspect: float) -> _TileGrid:
 
     choices = [grid(p, t) for p, t in product(range(1, panels + 1), range(1, tiles + 1))]
 
-    def worth(g: _TileGrid) -> float:
+    def compute_tile_size(g: _TileGrid) -> float:
         cells = g.tile_columns * ceil(tiles / g.tile_columns) * g.panel_columns * ceil(panels / g.panel_columns)
         return min(g.width, aspect * g.height) * sqrt(panels * tiles / cells)
 
-    return max(choices, key=worth)
+    return max(choices, key=compute_tile_size)
 
 
 def _draw_title(page: Figure, panels: Mapping[str, Sequence[tuple[str, RecordingReplay]]]) -> None:

@@ -83,10 +83,10 @@ class _ScalarAsTuple:
     """Validator that accepts a single value for a tuple of one."""
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> core_schema.CoreSchema:
-        def many(value: Any) -> tuple[Any, ...]:
+        def convert_to_tuple(value: Any) -> tuple[Any, ...]:
             return (*cast(Sequence[Any], value),) if isinstance(value, list | tuple) else (value,)
 
-        return core_schema.no_info_before_validator_function(many, handler(source))
+        return core_schema.no_info_before_validator_function(convert_to_tuple, handler(source))
 
     def __get_pydantic_json_schema__(
         self, schema: core_schema.CoreSchema, handler: GetJsonSchemaHandler

@@ -56,13 +56,13 @@ def retry_on_mismatch(measure: Callable[P, T]) -> Callable[P, T]:
     """Repeat a measurement once if its clocks disagree; a second ClockMismatch is raised."""
 
     @wraps(measure)
-    def twice(*arguments: P.args, **named: P.kwargs) -> T:
+    def measure_twice(*arguments: P.args, **named: P.kwargs) -> T:
         try:
             return measure(*arguments, **named)
         except ClockMismatch:
             return measure(*arguments, **named)
 
-    return twice
+    return measure_twice
 
 
 @dataclass

@@ -47,16 +47,16 @@ def intersection_free_guess(problem: StepProblem) -> StepProblem:
     energies = [energy for energy in problem.energies if is_barrier_energy(energy)]
     p = problem.step_start.positions
 
-    def free(q: Positions) -> bool:
+    def is_free(q: Positions) -> bool:
         return all(energy.collision_free_step_size_moving(p, q - p, 0.0) == 1.0 for energy in energies)
 
     start, rest = p, np.zeros_like(p)
-    if not free(p) and all(energy.at_fraction(0.0).collision_free_step_size(p, rest) == 1.0 for energy in energies):
+    if not is_free(p) and all(energy.at_fraction(0.0).collision_free_step_size(p, rest) == 1.0 for energy in energies):
         start = _find_clear_positions(problem, energies)
-    current = problem.current_positions if free(problem.current_positions) else start
+    current = problem.current_positions if is_free(problem.current_positions) else start
     guess = current
     if problem.initial_guess is not problem.current_positions:
-        guess = problem.initial_guess if free(problem.initial_guess) else start
+        guess = problem.initial_guess if is_free(problem.initial_guess) else start
     if current is problem.current_positions and guess is problem.initial_guess:
         return problem
     return replace(problem, current_positions=current, initial_guess=guess)

@@ -125,12 +125,12 @@ def _minimum_diagonal_blocks(metric: ResidualMetric) -> NDArray[np.float64]:
 def _extend_to_all_vertices(free: NDArray[np.int64], solve: Preconditioner) -> Preconditioner:
     """Extend a solve for free vertices (f,) to all vertices (n, 3)."""
 
-    def whole(b: Positions) -> Positions:
+    def solve_free(b: Positions) -> Positions:
         out = np.zeros_like(b)
         out[free] = solve(b[free])
         return out
 
-    return whole
+    return solve_free
 
 
 def assemble_diagonal_blocks(step: StepObjective, hessian: Hessian, p: Positions) -> NDArray[np.float64]:

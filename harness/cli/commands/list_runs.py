@@ -118,14 +118,14 @@ def collect_varied_settings(runs: Sequence[RunSpec]) -> dict[str, list[str]]:
     for run in runs:
         groups.setdefault((run.scene_name, run.size, run.solver.name), []).append(run)
 
-    def differ(value: Callable[[RunSpec], Any]) -> bool:
+    def has_several_values(value: Callable[[RunSpec], Any]) -> bool:
         return any(len({repr(value(run)) for run in group}) > 1 for group in groups.values())
 
     values: dict[str, Callable[[RunSpec], Any]] = {name: attrgetter(name) for name in RUN_OPTIONS}
-    columns = {name: value for name, value in values.items() if name in _FIXED_COLUMNS or differ(value)}
+    columns = {name: value for name, value in values.items() if name in _FIXED_COLUMNS or has_several_values(value)}
     for key in sorted({key for run in runs for key in run.solver.parameters}):
         parameter = partial(_get_parameter, key)
-        if differ(parameter):
+        if has_several_values(parameter):
             columns[key] = parameter
     return {
         name: ["" if (cell := value(run)) is None else str(cell) for run in runs] for name, value in columns.items()

@@ -71,7 +71,7 @@ def search_grid(
             spec, measure(replace(spec, measurement=replace(spec.measurement, time_limit=time_limit)))
         )
 
-    rule = GiveUpRule(SLOWER, LEAST_LIMIT / t_end, _slow(error))
+    rule = GiveUpRule(SLOWER, LEAST_LIMIT / t_end, _describe_slow_settings(error))
     candidates = [(0.0, _propose_settings(grid, error, rule, omitted)) for grid in _group_by_method(specs)]
     return search_best_first(
         candidates, run_trial, error, rule, best_cost=best, search_time=search_time, omitted=omitted
@@ -142,7 +142,7 @@ def is_measured(row: Mapping[str, Any]) -> bool:
     return row["status"] == "ok" or (row["status"] == "uncertified" and has_time)
 
 
-def _slow(error: float) -> str:
+def _describe_slow_settings(error: float) -> str:
     if not error:
         return "they or their faster neighbours take longer than the budget allows"
     return f"they or their faster neighbours take {SLOWER:g} times as long as the best within {error:g}, or too long"

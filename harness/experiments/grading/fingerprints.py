@@ -297,7 +297,7 @@ class FingerprintFinder:
         count = len(compared.scales)
         screening = compared.select_steps(sorted({0, min(1, count - 1), count // 2}))
         others = list[tuple[ProgramMistake, float]]()
-        ranked = [(self._best(one[1], screening), place, *one) for place, one in enumerate(visible)]
+        ranked = [(self._compare_best(one[1], screening), place, *one) for place, one in enumerate(visible)]
         for mistake in MISTAKES:
             if outputs := list(_undo_output(mistake, submission)):
                 deviation = min(self._compare_output(undone, submission.precision) for undone in outputs)
@@ -306,7 +306,7 @@ class FingerprintFinder:
         found, farthest = dict[str, tuple[ProgramMistake, float]](), 0.0
         for place, (screened, _, mistake, program) in enumerate(ranked):
             if place < NUM_FINALISTS:
-                d = self._best(program, compared)
+                d = self._compare_best(program, compared)
                 farthest = max(farthest, d)
             else:
                 d = max(screened, farthest)
@@ -314,7 +314,7 @@ class FingerprintFinder:
                 found[mistake.name] = mistake, d
         return [*found.values(), *others]
 
-    def _best(self, program: AssignmentProgram, compared: _Comparison) -> float:
+    def _compare_best(self, program: AssignmentProgram, compared: _Comparison) -> float:
         """Return D of a program with the number of iterations that fits best."""
         first = 0 if program.explicit_at else MIN_MISTAKEN_ITERATIONS - 1
         return float(self._compare(program, compared)[first:].min())
@@ -336,7 +336,7 @@ class FingerprintFinder:
         some = compared.select_steps(sorted({0, min(1, count - 1), count - 1}))
 
         def deviation(logarithm: float) -> float:
-            return self._best(change_time_step(self._correct, dt * float(np.exp(logarithm))), some)
+            return self._compare_best(change_time_step(self._correct, dt * float(np.exp(logarithm))), some)
 
         grid = np.linspace(-np.log(TIME_STEP_RANGE), np.log(TIME_STEP_RANGE), 16)  # an even number: none at 0
         values = [deviation(x) for x in grid]
@@ -346,7 +346,7 @@ class FingerprintFinder:
         found = dt * float(np.exp(best.x))
         if abs(best.x) < SAME_TIME_STEP:
             return _describe_time_step(found, dt), np.inf
-        return _describe_time_step(found, dt), self._best(change_time_step(self._correct, found), compared)
+        return _describe_time_step(found, dt), self._compare_best(change_time_step(self._correct, found), compared)
 
     def _find_visible_programs(self, compared: _Comparison) -> list[tuple[ProgramMistake, AssignmentProgram]]:
         """Return the mistakes and their programs whose steps differ from those of the correct program."""

@@ -119,7 +119,7 @@ def predict_seconds(past_timings: Sequence[PastTiming], vertices: int, run: RunS
     if not known:
         return 0.0
 
-    def at(field: str) -> float:
+    def extrapolate(field: str) -> float:
         last = getattr(known[-1], field)
         if len(known) == 1:
             return last * vertices / known[-1].num_vertices
@@ -127,7 +127,9 @@ def predict_seconds(past_timings: Sequence[PastTiming], vertices: int, run: RunS
         power = max(1.0, log(last / getattr(known[-2], field)) / grown)
         return last * exp(power * log(vertices / known[-1].num_vertices))
 
-    return NUM_PREPARATIONS * at("prepare_seconds") + run.rounds * run.max_iterations * at("iteration_seconds")
+    return NUM_PREPARATIONS * extrapolate("prepare_seconds") + run.rounds * run.max_iterations * extrapolate(
+        "iteration_seconds"
+    )
 
 
 @contextmanager

@@ -69,13 +69,13 @@ class SewingEffect(ConfigModel):
         at_rest = np.linalg.norm(mesh.rest_positions[pairs[:, 0]] - mesh.rest_positions[pairs[:, 1]], axis=1)
         drawn = np.minimum(at_rest, self.final_length)
 
-        def longest(time: float) -> NDArray[np.float64]:
+        def compute_max_length(time: float) -> NDArray[np.float64]:
             long = self.end_time - self.start_time
             done = float(np.clip((time - self.start_time) / long, 0.0, 1.0)) if long else float(time >= self.start_time)
             return at_rest + done * (drawn - at_rest)
 
         k = np.full(len(pairs), self.stiffness / len(pairs))
-        return EffectContribution(energies=(Energy.from_rest_shape(mesh.rest_positions, pairs, k, longest),))
+        return EffectContribution(energies=(Energy.from_rest_shape(mesh.rest_positions, pairs, k, compute_max_length),))
 
 
 def _match_rows(mesh: Mesh, first: IndexArray, second: IndexArray) -> IndexArray:
