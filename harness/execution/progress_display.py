@@ -269,7 +269,7 @@ def _format_running(going: Sequence[_RunState]) -> str:
     A run that does not wait is preferred.
     """
     run = min(going, key=lambda one: bool(one.activity))
-    others = f"; {len(going) - 1} more at hand" if len(going) > 1 else ""
+    others = f"; {len(going) - 1} more in progress" if len(going) > 1 else ""
     return f"{run.title}: {run.status_text}, {100 * run.fraction_done:.0f} %{others}"
 
 

@@ -54,7 +54,7 @@ MAX_CLOCK_OFFSET = 60.0
 _MAX_ATTEMPTS = 4
 """Largest number of attempts for a run whose worker is lost."""
 
-_SCHEDULER_LOST_MESSAGE = "the scheduler is gone; completed results remain, and the same command does the rest"
+_SCHEDULER_LOST_MESSAGE = "the scheduler was lost; completed results remain, and the same command resumes"
 
 _WORKER_POLL_SECONDS, _TASK_POLL_SECONDS = 1.0, 0.05
 """Seconds between two queries of the workers; seconds between two queries of the tasks if none has finished."""

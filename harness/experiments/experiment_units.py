@@ -133,7 +133,7 @@ def execute_unclaimed(
             return why
 
         execute_batch(todo, claim_unit)
-        waits = f"waiting for other commands, which have {len(left)} of these at hand"
+        waits = f"waiting for other commands, which execute {len(left)} of these"
         claims.wait_for_any([unit.rows_path for unit in left], partial(remarks, waits))
         todo = left
 

@@ -129,5 +129,5 @@ def require_intact(path: Path, read_recording: Callable[[Path], None]) -> None:
     try:
         sandbox.call_in_sandbox(read_recording, path, limits=limits)
     except sandbox.SandboxError as error:
-        raise InputError(InputMistake(f"is damaged: {error}; do its run again", file=path)) from None
+        raise InputError(InputMistake(f"is damaged: {error}; repeat its run", file=path)) from None
     mark_verified(path)

@@ -109,7 +109,7 @@ def test_a_column_of_another_type_is_named_before_anything_is_written(two: Path)
 def test_what_cannot_be_merged_is_the_users_mistake(two: Path):
     with pytest.raises(InputError, match="of one kind"):
         merge_results([two / "a", two / "b" / "sweep"], two / "all", lambda line: None)
-    with pytest.raises(InputError, match="in each other"):
+    with pytest.raises(InputError, match="expected a separate folder"):
         merge_results([two / "a", two / "b"], two / "a" / "all", lambda line: None)
     (two / "empty").mkdir()
     with pytest.raises(InputError, match="contains no rows"):

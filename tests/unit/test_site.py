@@ -270,7 +270,7 @@ def test_damaged_rows_prevent_no_run_from_ending(tmp_path: Path):
     (tmp_path / "sweep" / "rows" / "x.parquet").write_text("no rows")
     said: list[str] = []
     refresh_results_page(tmp_path, tmp_path / "sweep", said.append)
-    assert "stays as it was" in said[0]
+    assert "was not changed" in said[0]
     assert "x.parquet" in said[0]
     with pytest.raises(InputError, match=r"x\.parquet"):
         update_page(tmp_path)

@@ -270,7 +270,7 @@ def _export_setting(
     step = f"{simulator.name}: steps of {spec.time_step / setting.substeps:.9g} s"
     lines = [f"{step}, {setting.iterations} iterations each" if simulator.has_iterations else step]
     if end is None:
-        return [*lines, "no script of it, for it failed"]
+        return [*lines, "no script, because the setting failed"]
     try:
         texts = write_engine_script(name, scene, engine, setting.substeps, frames, folder, end)
     except RunFailed as refused:

@@ -90,7 +90,7 @@ def publish_results(
             relative_path = os.path.relpath(f"configs/{name}/{config.name}", f"results/{name}")
             content[f"results/{name}/{CLAIM}"] = os.fsencode(f"{relative_path}\n")
         else:
-            gone = f"what it names as its config, {config}, is none" if config else "its config is not there any more"
+            gone = f"{config}, which it states as its config, is none" if config else "its config does not exist"
             print_message(f"{folder}: {gone}, so its runs cannot be repeated")
     odd = "its name is no UTF-8, or breaks a line; rename it"
     refused += [InputMistake(odd, Path(name)) for name in content if _INVALID_NAME_CHARACTERS.search(name)]

@@ -85,7 +85,7 @@ def merge_results(sources: Sequence[Path], target: Path, print_message: Callable
     for source in sources:
         if target.resolve().is_relative_to(source.resolve()) or source.resolve().is_relative_to(target.resolve()):
             raise InputError(
-                InputMistake(f"and {source} lie in each other; expected a folder next to them", target, key="--output")
+                InputMistake(f"contains {source} or lies in it; expected a separate folder", target, key="--output")
             )
     places = {(source, folder.relative_to(source)) for source in sources for folder in list_sweep_folders(source)}
     if len({place == Path() for _, place in places}) > 1:

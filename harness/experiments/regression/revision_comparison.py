@@ -168,7 +168,7 @@ def compare_revisions(
             )
             found[index] = result
             is_final = budget == budgets[-1] or result.verdict is not RegressionVerdict.INCONCLUSIVE
-            print_message(f"{request.title}: {result if is_final else 'not clear yet'}")
+            print_message(f"{request.title}: {result if is_final else 'undecided so far'}")
             if done < len(todo):
                 left = _format_minutes((monotonic() - began) / done * (len(todo) - done))
                 print_message(f"{done} of {len(todo)}, about {left} left in this pass")

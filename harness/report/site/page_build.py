@@ -97,7 +97,7 @@ def refresh_results_page(
         if not is_quiet:
             print_message(f"all results are on one page: {page}")
     except InputError as error:
-        print_message(f"the page of all results stays as it was: {error}")
+        print_message(f"the page of all results was not changed: {error}")
 
 
 def _write_sweep(data_folder: Path, folder: SweepFolder, content: SweepOverview, state: str) -> None:
