@@ -199,7 +199,7 @@ class _ConvergenceMonitor:
             self.status = "ok"
         elif is_unchanged:
             self.status = "ok" if stationarity <= UNCHANGED_STATIONARITY_TOLERANCE else "no-progress"
-            self.reason = f"positions no longer change {at}"
+            self.reason = f"positions do not change {at}"
         elif solver_seconds > self._time_limit:
             self.status, self.reason = "time-limit", f"the limit of {self._time_limit:g} s was reached {at}"
         elif number == self._max_iterations:
