@@ -93,6 +93,7 @@ PARTICIPLE = re.compile(
 VERBS = {
     "codegen": "a property that Numba prescribes",
     "_shorten": "a verb that ends in en",
+    "__len__": "a method that Python prescribes",
 }
 """Names of functions that end as a past participle does, and why."""
 
