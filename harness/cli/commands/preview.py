@@ -50,7 +50,6 @@ def _draw_preview(run: RunSpec, path: Path, tick: ProgressCallback) -> list[str]
     from springbench.harness.report.scene_preview import MarkedPoints, draw_scene_preview
     from springbench.harness.scenes.scene_builder import build_scene
     from springbench.harness.scenes.vertex_selectors import find_selections
-    from springbench.harness.simulation.time_loop import build_initial_state
 
     scene, lines = run.scene.load_plugins(), list[str]()
     made = build_scene(scene, run.size)
@@ -71,7 +70,7 @@ def _draw_preview(run: RunSpec, path: Path, tick: ProgressCallback) -> list[str]
         run_id="",
         frames=np.zeros(1, np.int64),
         times=np.zeros(1),
-        positions=store_relative(build_initial_state(made).motion.positions, origin)[None],
+        positions=store_relative(made.start.compute_positions(mesh.rest_positions), origin)[None],
         triangles=mesh.triangles,
         springs=made.all_springs.edges,
         rest_lengths=made.all_springs.rest_length,
