@@ -13,14 +13,16 @@ from springbench.harness.config.sweep_config import REPORT_TABLE
 from springbench.harness.errors import InputError, InputMistake, RunFailed, SpringbenchError, format_allowed_names
 from springbench.harness.report.ablation_summary import read_ablations
 from springbench.harness.report.accuracy.accuracy_reader import read_accuracy
+from springbench.harness.report.change_detection import MIN_RESULTS, find_stored_files, read_histories
 from springbench.harness.report.charts.ablation_charts import build_effect_chart, build_overhead_chart
-from springbench.harness.report.charts.chart_description import ChartDescription, select_panels
+from springbench.harness.report.charts.benchmark_chart import RATIO_CHART, TIME_CHART, build_benchmark_chart
+from springbench.harness.report.charts.chart_description import ChartDescription, select_curve_plots, select_panels
 from springbench.harness.report.charts.chart_table import build_compared_chart
 from springbench.harness.report.charts.device_chart import build_device_chart
 from springbench.harness.report.charts.figure_panels import CellMap, FigurePanel, MeshPicture, merge_cell_maps
 from springbench.harness.report.charts.hard_case_chart import build_hard_case_chart
 from springbench.harness.report.device_speedup import read_device_runs
-from springbench.harness.report.figures import benchmark_panels, timing_panels
+from springbench.harness.report.figures import timing_panels
 from springbench.harness.report.figures.panel_selection import PanelEntry, entries_from_panels
 from springbench.harness.report.provenance_words import PROVENANCE_COLUMNS, describe_provenance
 from springbench.harness.report.robustness import read_verified_runs
@@ -121,8 +123,18 @@ def _list_hard_case_panels(folder: Path, find_stale: timing_panels.StaleFinder) 
     )
 
 
+def _list_benchmark_panels(folder: Path) -> list[PanelEntry]:
+    """Build a panel for each benchmark with enough results, the largest change first."""
+    known = [one for one in read_histories(find_stored_files([folder])) if len(one.points) >= MIN_RESULTS]
+    charts = (build_benchmark_chart(RATIO_CHART if one.is_ratio else TIME_CHART, [one]) for one in known)
+    return entries_from_panels(plot for chart in charts for plot in select_curve_plots(chart))
+
+
 _MESH_PANELS = "springbench.harness.report.figures.mesh_panels"
 _ACCURACY_ROWS, _SWEEP_ROWS = "rows of `springbench accuracy CONFIG`", "rows of `springbench run CONFIG`"
+_BENCHMARK_RESULTS = (
+    f"{MIN_RESULTS} stored results of a benchmark, by `pytest tests/bench --benchmark-only` at as many commits"
+)
 _GAP_PANELS = (("gap", "time"), ("gap", "iterations"))
 _PROFILE_PANELS = tuple(("performance", gap) for gap in ("1e-1", "1e-3", "1e-6"))
 
@@ -198,8 +210,8 @@ FIGURE_KINDS: dict[str, FigureKind] = {
     ),
     "history": FigureKind(
         "Results of a benchmark, by commit",
-        benchmark_panels.REQUIRED_RESULTS,
-        _without_stale(benchmark_panels.benchmark_panels),
+        _BENCHMARK_RESULTS,
+        _without_stale(_list_benchmark_panels),
     ),
 }
 
