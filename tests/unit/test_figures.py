@@ -28,8 +28,8 @@ from springbench.harness.report.figures.figure_layout import (
     sort_by_end_value,
     visible_texts,
 )
+from springbench.harness.report.figures.figure_maker import find_layout_faults
 from springbench.harness.report.figures.figure_options import MIN_FONT_SIZE, FigureOptions
-from springbench.harness.report.figures.layout_checks import find_layout_faults
 from springbench.harness.report.figures.panel_drawing import marker_style
 from springbench.harness.report.plot_style import SeriesStyle
 from typer.testing import CliRunner
