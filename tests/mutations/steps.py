@@ -124,7 +124,7 @@ _TABLE = (
     ),
     (
         "explicit-drift",
-        "solvers/methods/time_stepping/symplectic_euler_kernel.py",
+        "solvers/methods/time_stepping/symplectic_euler.py",
         "p[k] += h * v[k]",
         "p[k] += 0.9 * h * v[k]",
         f"{_U}/test_symplectic_euler.py",

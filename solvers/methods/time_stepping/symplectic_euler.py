@@ -24,12 +24,12 @@ from numpy.typing import NDArray
 from springbench.solvers.iteration import vertex_terms
 from springbench.solvers.iteration.iterative_solver import IterativeSolver, SolverState
 from springbench.solvers.iteration.solver_info import Citation, SolverInfo
+from springbench.solvers.jit.kernel_compilation import jit_kernel
 from springbench.solvers.jit.typed_kernel import TypedKernel
-from springbench.solvers.kernels.spring_local_step import SpringPackets
+from springbench.solvers.kernels.spring_local_step import SpringPackets, add_descent
 from springbench.solvers.methods.local_global.prefactored import require_only_springs
 from springbench.solvers.methods.time_stepping.explicit_forces import SingleIterateState, pad_rows
 from springbench.solvers.methods.time_stepping.substep_choice import STABILITY_SAFETY, require_few_evaluations
-from springbench.solvers.methods.time_stepping.symplectic_euler_kernel import run_symplectic_euler
 from springbench.solvers.model.energies.spring_energy import Springs
 from springbench.solvers.model.step_problem import (
     Positions,
@@ -156,3 +156,35 @@ class PreparedSymplecticEuler(IterativeSolver):
         velocity = v.reshape(-1, 4)[: s.num_vertices, :3].copy()
         velocity[pins] = (end - begin) / s.time_step
         return p.reshape(-1, 4)[: s.num_vertices, :3].copy(), velocity
+
+
+@jit_kernel
+def run_symplectic_euler(bundles, pins, begin, end, force, rate, h, count, p, v, acceleration):
+    """Run `count` substeps of size h, with the springs in packets of eight vertices.
+
+    The arrays p and v, in rows of four, are overwritten with the result.
+
+    Args:
+        bundles: packets of the springs.
+        pins: vertices (q,) that move uniformly from `begin` to `end`.
+        begin, end: positions of the pins (q, 3) [m].
+        force: force [N] in the layout of the packets' right-hand side, with zero anchor stiffness.
+        rate: h/m (n,) [s/kg], 0 for pinned vertices.
+        h: step size [s].
+        count: number of substeps.
+        p: positions [m].
+        v: velocities [m/s].
+        acceleration: scratch in rows of four.
+    """
+    for step in range(1, count + 1):
+        for k in range(len(acceleration)):
+            acceleration[k] = 0.0
+        add_descent(bundles, 0, len(bundles.packet_start) - 1, p, force, acceleration, 0)
+        for i in range(len(rate)):
+            for k in range(4 * i, 4 * i + 3):
+                v[k] += rate[i] * acceleration[k]
+                p[k] += h * v[k]
+        left = (count - step) / count
+        for q in range(len(pins)):
+            for c in range(3):
+                p[4 * pins[q] + c] = end[q, c] + left * (begin[q, c] - end[q, c])
