@@ -27,15 +27,15 @@ from numpy.typing import NDArray
 from springbench.solvers.iteration import vertex_terms
 from springbench.solvers.iteration.iterative_solver import IterativeSolver, SolverState
 from springbench.solvers.iteration.solver_info import Citation, SolverInfo
+from springbench.solvers.jit.kernel_compilation import jit_kernel
 from springbench.solvers.jit.typed_kernel import TypedKernel
 from springbench.solvers.linalg.solver_selection import build_linear_solver
-from springbench.solvers.methods.local_global import admm_local_step as kernels
 from springbench.solvers.methods.local_global.prefactored import (
     PreparedLocalGlobal,
     prepare_local_global,
     require_projective,
 )
-from springbench.solvers.model.energies.edge_energy import EdgeEnergy
+from springbench.solvers.model.energies.edge_energy import ZERO_LENGTH, EdgeEnergy
 from springbench.solvers.model.energies.quadratic_energy import Quadratic
 from springbench.solvers.model.energies.spring_energy import Springs
 from springbench.solvers.model.energies.strain_limit_energy import StrainLimits
@@ -155,7 +155,7 @@ class PreparedAdmm(IterativeSolver):
             weight,
         )
         self.description, self.stats = base.description, base.stats
-        self.project_edges = TypedKernel(kernels.run_admm_local_step)
+        self.project_edges = TypedKernel(run_admm_local_step)
 
     def init_state(self, problem: StepProblem, initial_guess: Positions) -> SolverState:
         """Start a solve from an initial guess.
@@ -219,3 +219,47 @@ class _AdmmState(SolverState):
         return self._residual_metric.correction_residual(
             self._residual_metric.solve_correction(gradient, np.zeros_like(gradient))
         )
+
+
+@jit_kernel
+def run_admm_local_step(edges, stiffness, low, high, rest_direction, weight, p, constant, u, out):
+    """Write constant + W A'K (z - u) [N] to `out` and update u.
+
+    Args:
+        edges: (m, 2).
+        stiffness: (m,) [N/m].
+        low, high: minimum and maximum lengths [m] without energy (m,).
+        rest_direction: direction at zero length (m, 3).
+        weight: W.
+        p: positions (n, 3) [m].
+        constant: constant part (n, 3) [N].
+        u: scaled dual variables (m, 3) [m].
+        out: output (n, 3) [N].
+    """
+    # z - u = (2 d + (W - 1) v)/(1 + W), with v = A p + u and d the nearest vector without energy
+    share, multiplier_share = 1.0 / (1.0 + weight), weight * (weight - 1.0) / (1.0 + weight)
+    for i in range(len(p)):
+        for c in range(3):
+            out[i, c] = constant[i, c]
+    for e in range(len(edges)):
+        i, j, k = edges[e, 0], edges[e, 1], stiffness[e]
+        v0, v1, v2 = p[i, 0] - p[j, 0] + u[e, 0], p[i, 1] - p[j, 1] + u[e, 1], p[i, 2] - p[j, 2] + u[e, 2]
+        length = np.sqrt(v0 * v0 + v1 * v1 + v2 * v2)
+        d0, d1, d2 = rest_direction[e, 0], rest_direction[e, 1], rest_direction[e, 2]
+        if length > ZERO_LENGTH:
+            d0, d1, d2 = v0 / length, v1 / length, v2 / length
+        t = min(max(length, low[e]), high[e])
+        d0, d1, d2 = t * d0, t * d1, t * d2
+        u[e, 0], u[e, 1], u[e, 2] = share * (v0 - d0), share * (v1 - d1), share * (v2 - d2)
+        f0, f1, f2 = 2.0 * weight * share * d0, 2.0 * weight * share * d1, 2.0 * weight * share * d2
+        f0, f1, f2 = (
+            k * (f0 + multiplier_share * v0),
+            k * (f1 + multiplier_share * v1),
+            k * (f2 + multiplier_share * v2),
+        )
+        out[i, 0] += f0
+        out[i, 1] += f1
+        out[i, 2] += f2
+        out[j, 0] -= f0
+        out[j, 1] -= f1
+        out[j, 2] -= f2
