@@ -159,7 +159,6 @@ UNIX_CALLS = re.compile(
 GUARDED_CALLS = {
     "harness/execution/interrupts.py": "sys.platform",
     "harness/experiments/archive/compaction.py": 'hasattr(os, "O_DIRECTORY")',
-    "harness/execution/process_memory.py": "OSError",
     "harness/simulation/stopwatch.py": 'hasattr(time, "CLOCK_MONOTONIC_RAW")',
     **dict.fromkeys(
         (f"harness/execution/{name}.py" for name in ("isolated_worker", "sandbox")), "can_isolate_processes()"
