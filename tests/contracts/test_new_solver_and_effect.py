@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from springbench.harness.config.accuracy_loader import load_accuracy
 from springbench.harness.config.config_loader import load_config
 from springbench.harness.config.json_schema import build_json_schema
-from springbench.harness.experiments.ablation.effect_suggestions import build_evidence, suggest_effects
+from springbench.harness.experiments.ablation.ablation_unit import build_evidence, suggest_effects
 from springbench.harness.experiments.accuracy.accuracy_study import run_accuracy_study
 from springbench.harness.experiments.run_pipeline import execute_run
 from springbench.harness.experiments.sweep_plan import RunFiles

@@ -6,8 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from springbench.harness.experiments.ablation import effect_suggestions
-from springbench.harness.experiments.ablation.effect_suggestions import EffectSuggestion
+from springbench.harness.experiments.ablation.ablation_unit import EffectSuggestion, build_evidence, suggest_effects
 from springbench.harness.scenes.effects.springs_effect import SpringsEffect
 from springbench.harness.scenes.mesh.grid_mesh import GridMesh
 from springbench.harness.scenes.scene_builder import Scene
@@ -21,9 +20,7 @@ def suggest(
 ) -> list[EffectSuggestion]:
     """What a motion calls for that passes through positions (n, 3) for 12 frames."""
     places = np.tile(positions, (12, 1, 1))
-    return effect_suggestions.suggest_effects(
-        effect_suggestions.build_evidence(made, kinds, places, np.broadcast_to(velocities, places.shape)), kinds
-    )
+    return suggest_effects(build_evidence(made, kinds, places, np.broadcast_to(velocities, places.shape)), kinds)
 
 
 def fold_cloth(made: Scene, angle: float) -> np.ndarray:

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any, NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
 from springbench.harness.config.config_loader import SweepPlan
 from springbench.harness.config.sweep_config import RunSpec
 from springbench.harness.execution import folder_locks, machine_info
 from springbench.harness.execution.isolated_worker import ProgressCallback
 from springbench.harness.execution.progress_display import ProgressDisplay
-from springbench.harness.experiments.ablation.effect_suggestions import build_evidence, suggest_effects
 from springbench.harness.experiments.ablation.effect_unit import EffectUnit, ResultRow
 from springbench.harness.experiments.ablation.interleaved_variants import (
     VariantRun,
@@ -30,6 +32,8 @@ from springbench.harness.experiments.completion_status import select_missing_uni
 from springbench.harness.experiments.experiment_units import execute_units
 from springbench.harness.experiments.failure_columns import build_failure_columns
 from springbench.harness.experiments.provenance import build_provenance_columns, build_specification_columns
+from springbench.harness.scenes.effects.effect_interface import ObservedMotion
+from springbench.harness.scenes.effects.effect_table import EFFECT_CLASSES, EFFECT_TABLE
 from springbench.harness.scenes.scene_builder import Scene, build_scene
 from springbench.harness.simulation.auto_tolerance import build_stop_rule
 from springbench.harness.simulation.timing_pass import SteppingSettings
@@ -230,3 +234,58 @@ def _add_shared_columns(run: RunSpec, scene: Scene, rows: list[ResultRow]) -> li
         "bounding_box_diagonal": scene.mesh.bounding_box_diagonal / compute_mean_rest_length(scene),
     }
     return [shared | build_provenance_columns() | row for row in rows]
+
+
+class EffectSuggestion(NamedTuple):
+    """Kind of the suggested effect, and the evidence for it."""
+
+    effect_kind: str
+    evidence: str
+
+
+def build_evidence(
+    scene: Scene, effect_kinds: Collection[str], positions: NDArray[np.float64], velocities: NDArray[np.float64]
+) -> ObservedMotion:
+    """Collect the evidence from a scene and its motion.
+
+    Args:
+        scene: the scene.
+        effect_kinds: kinds of its effects.
+        positions: (frames, n, 3) [m].
+        velocities: (frames, n, 3) [m/s].
+    """
+    return ObservedMotion(
+        mesh=scene.mesh,
+        springs=scene.all_springs,
+        mean_spring_length=compute_mean_rest_length(scene),
+        mass=scene.system.mass,
+        time_step=scene.system.time_step,
+        has_pins=bool(len(scene.system.pins.vertices)),
+        is_driven=bool(scene.varying_forces or scene.pin_motions),
+        is_damped=any(getattr(_load_effect_class(kind), "is_dissipative", False) for kind in effect_kinds),
+        positions=positions,
+        velocities=velocities,
+    )
+
+
+def suggest_effects(evidence: ObservedMotion, effect_kinds: Collection[str]) -> list[EffectSuggestion]:
+    """Return the unlisted effects that the evidence indicates, in a fixed order.
+
+    Each suggestion states its evidence. The class of an effect defines the evidence for it
+    (`springbench.harness.scenes.effects.effect_interface.SceneEffect`).
+
+    Args:
+        evidence: evidence from the motion.
+        effect_kinds: kinds of the effects that the scene lists.
+    """
+    absent = [
+        kind
+        for kind in EFFECT_CLASSES
+        if kind not in effect_kinds and hasattr(_load_effect_class(kind), "find_evidence")
+    ]
+    suggestions = (EffectSuggestion(kind, _load_effect_class(kind).find_evidence(evidence)) for kind in absent)
+    return [suggestion for suggestion in suggestions if suggestion.evidence]
+
+
+def _load_effect_class(kind: str) -> Any:
+    return load_target(EFFECT_TABLE[kind])
