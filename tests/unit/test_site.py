@@ -16,10 +16,9 @@ from springbench.harness.errors import InputError
 from springbench.harness.report.site import refresh_results_page, sweep_overview, update_page
 from springbench.harness.report.site.data_scripts import encode_column
 from springbench.harness.report.site.failure_causes import FailedRun, group_failures
-from springbench.harness.report.site.run_findings import describe_runs
 from springbench.harness.report.site.run_table import build_run_table
 from springbench.harness.report.site.sweep_folders import locate_folder
-from springbench.harness.report.site.sweep_overview import _select_pictures
+from springbench.harness.report.site.sweep_overview import _select_pictures, describe_runs
 from springbench.harness.results import parquet_rows
 from springbench.harness.results.run_schema import RUN_SCHEMA
 

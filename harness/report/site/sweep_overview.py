@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 import re
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,6 +19,7 @@ import pyarrow.parquet as pq
 from springbench.harness.atomic_files import atomic_write
 from springbench.harness.errors import InputError, InputMistake
 from springbench.harness.execution.optional_parts import RECORDINGS
+from springbench.harness.report import equal_accuracy
 from springbench.harness.report.ablation_summary import select_kind, summarise_ablation
 from springbench.harness.report.charts.ablation_charts import build_effect_chart, build_overhead_chart
 from springbench.harness.report.charts.device_chart import build_device_chart
@@ -34,7 +35,6 @@ from springbench.harness.report.site import (
 )
 from springbench.harness.report.site.chart_json import serialise_chart
 from springbench.harness.report.site.failure_causes import FailedRun, group_failures
-from springbench.harness.report.site.run_findings import describe_runs
 from springbench.harness.report.site.sweep_folders import SweepFolder, find_benchmark_files
 from springbench.harness.report.speed.speed_figures import compute_speed_figures, has_machine_limits
 from springbench.harness.report.speed.speed_table import describe_speed
@@ -180,6 +180,30 @@ def _build_run_section(
     }
     bad = group_failures(one for one in failed if one.status != "ok")
     return _PageSection(scripts, plots, findings, bad, row_provenance.collect_provenance(table, "run_id"), facts)
+
+
+def describe_runs(run_records: Sequence[run_table.RunRecord]) -> list[dict[str, Any]]:
+    """Describe runs in sentences, each with the ids of its runs (`equal_accuracy`)."""
+    names = {run["run_id"]: run["label"] for run in run_records}
+    sentences = [
+        {"text": words, "runs": runs}
+        for compared in equal_accuracy.compare_runs(map(run_table.restore_run_times, run_records))
+        for words, runs in equal_accuracy.describe_comparison(compared, names)
+    ]
+    return sentences + list(_describe_unconverged(run_records))
+
+
+def _describe_unconverged(run_records: Sequence[run_table.RunRecord]) -> Iterator[dict[str, Any]]:
+    """Describe how many runs ended a step at the iteration limit or at a saddle."""
+    done = [run for run in run_records if run["status"] == "ok" and run["termination_reason"]]
+    for reason, words in (
+        ("max-iter", "at the limit of iterations: look at residuals"),
+        ("saddle", "at a saddle, not a minimum: allow more iterations"),
+    ):
+        short = [run for run in done if run["termination_reason"] == reason]
+        if short:
+            text = f"{len(short)} of {len(done)} runs ended a step {words}."
+            yield {"text": text, "runs": [short[0]["run_id"]], "filter": {"termination_reason": reason}}
 
 
 def _mark_recordings(
