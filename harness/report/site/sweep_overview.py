@@ -30,7 +30,6 @@ from springbench.harness.report.device_speedup import read_device_runs, summaris
 from springbench.harness.report.robustness import build_map_headline, has_verification, read_verified_runs
 from springbench.harness.report.site import (
     frame_scripts,
-    row_provenance,
     run_table,
 )
 from springbench.harness.report.site.chart_json import serialise_chart
@@ -38,8 +37,9 @@ from springbench.harness.report.site.failure_causes import FailedRun, group_fail
 from springbench.harness.report.site.sweep_folders import SweepFolder, find_benchmark_files
 from springbench.harness.report.speed.speed_figures import compute_speed_figures, has_machine_limits
 from springbench.harness.report.speed.speed_table import describe_speed
+from springbench.harness.report.table_queries import query_table
 from springbench.harness.results import parquet_rows, row_store
-from springbench.harness.results.folder_ownership import find_config
+from springbench.harness.results.folder_ownership import find_config, read_owner
 
 PrintMessage = Callable[[str], None]
 
@@ -47,6 +47,15 @@ _MAX_PICTURES = 3
 """Maximum number of pictures of a sweep in the overview."""
 
 _HASH_SUFFIX = re.compile(r"-[0-9a-f]{12}$")
+
+_MACHINE_COLUMNS = ("machine_id", "cpu", "cores", "memory_gib", "operating_system", "commit")
+
+_PROVENANCE_QUERY = f"""
+select {", ".join(f'"{name}"' for name in _MACHINE_COLUMNS)},
+    list(distinct source_fingerprint order by source_fingerprint),
+    min(started_at), max(started_at), count(distinct {{unit}})
+from rows_of where machine_id is not null group by all order by max(started_at) desc
+"""
 
 
 class SweepOverview(NamedTuple):
@@ -99,7 +108,7 @@ def build_overview(
         "relative_url": folder.relative_url,
         "kinds": there,
         "config": find_config(folder.path),
-        "scenes": row_provenance.find_scene_files(folder.path),
+        "scenes": find_scene_files(folder.path),
         "provenance": made,
         "first_started_at": min((one["first_started_at"] or "" for one in made), default=""),
         "last_started_at": max((one["last_started_at"] or "" for one in made), default=""),
@@ -155,7 +164,7 @@ def _build_run_section(
         scripts["devices"] = serialise_chart(devices)
     if has_machine_limits(table):
         candidates = compute_speed_figures(table)
-        newest = row_provenance.find_newest_fingerprint(table)
+        newest = find_newest_fingerprint(table)
         scripts["speed"] = serialise_chart(build_speed_chart(candidates, newest, citations))
         findings = [{"text": words} for words in describe_speed(candidates)]
     outcomes: dict[str, Any] = {}
@@ -179,7 +188,7 @@ def _build_run_section(
         "num_stale_runs": sum(run["staleness"] == "stale" for run in found),
     }
     bad = group_failures(one for one in failed if one.status != "ok")
-    return _PageSection(scripts, plots, findings, bad, row_provenance.collect_provenance(table, "run_id"), facts)
+    return _PageSection(scripts, plots, findings, bad, collect_provenance(table, "run_id"), facts)
 
 
 def describe_runs(run_records: Sequence[run_table.RunRecord]) -> list[dict[str, Any]]:
@@ -284,7 +293,7 @@ def _build_accuracy_section(
         plots,
         findings,
         group_failures(failed),
-        row_provenance.collect_provenance(_read_rows(folder, "accuracy"), "unit_id"),
+        collect_provenance(_read_rows(folder, "accuracy"), "unit_id"),
         facts,
     )
 
@@ -297,7 +306,7 @@ def _build_ablation_section(
     for row in table.to_pylist():
         ablations.setdefault(row[row_store.FILE_COLUMN], []).append(row)
     rows = [row for some in ablations.values() for row in some]
-    newest = row_provenance.find_newest_fingerprint(table)
+    newest = find_newest_fingerprint(table)
     charts = {"ablation": build_effect_chart(ablations, newest), "prices": build_overhead_chart(rows, newest)}
     scripts = {name: serialise_chart(chart) for name, chart in charts.items() if chart.frames or chart.maps}
     words = [
@@ -314,7 +323,7 @@ def _build_ablation_section(
         plots,
         findings,
         [],
-        row_provenance.collect_provenance(table, row_store.FILE_COLUMN),
+        collect_provenance(table, row_store.FILE_COLUMN),
         {"ablations": len(words)},
     )
 
@@ -329,6 +338,45 @@ def _build_benchmark_section(
     plots = [(name, chart["title"]) for name, chart in scripts.items()]
     facts = {"benchmarks": len({item["benchmark"] for chart in scripts.values() for item in chart["items"]})}
     return _PageSection(scripts, plots, found, [], benchmark_charts.collect_benchmark_provenance(known), facts)
+
+
+def collect_provenance(table: pa.Table, unit: str) -> list[dict[str, Any]]:
+    """Collect machines and commits of rows, the newest first.
+
+    Args:
+        table: rows.
+        unit: column whose distinct values are counted.
+    """
+    lacking = [
+        name for name in (*_MACHINE_COLUMNS, "source_fingerprint", "started_at", unit) if name not in table.column_names
+    ]
+    for name in lacking:
+        table = table.append_column(name, pa.nulls(len(table), pa.string()))
+    names = (*_MACHINE_COLUMNS, "source_fingerprints", "first_started_at", "last_started_at", "count")
+    return [dict(zip(names, row, strict=True)) for row in query_table(_PROVENANCE_QUERY.format(unit=unit), table)]
+
+
+def find_newest_fingerprint(table: pa.Table) -> str:
+    """Return the fingerprint of the newest row's code; "" if it is unknown."""
+    dated = zip(*(table[name].to_pylist() for name in ("started_at", "source_fingerprint")), strict=True)
+    return max(((started or "", code or "") for started, code in dated), default=("", ""))[1]
+
+
+def find_scene_files(folder: Path) -> dict[str, str]:
+    """Find the scene files that a sweep's config lists, by scene name.
+
+    Paths are relative to the same folder as that of the config.
+    """
+    from springbench.harness.schema.yaml_loader import read_yaml
+
+    owner = read_owner(folder)
+    if owner is None:
+        return {}
+    called, data = find_config(folder), read_yaml(owner).data
+    if "mesh" in data:
+        return {Path(called).stem: called}
+    listed = [str(scene) for scene in data.get("scenes") or ()]
+    return {Path(scene).stem: (Path(called).parent / scene).as_posix() for scene in listed}
 
 
 def _read_rows(folder: SweepFolder, kind: str, print_message: PrintMessage = lambda words: None) -> pa.Table:
