@@ -295,7 +295,7 @@ class PreparedVertexBlockDescent(IterativeSolver):
 
     def build_half_spaces(self, contacts: list[VertexContactEnergy]) -> HalfSpaces:
         """Build the half-spaces of the contacts."""
-        from springbench.solvers.contact.half_space.packed_half_spaces import (
+        from springbench.solvers.methods.vertex_block.packed_half_spaces import (
             pack_half_spaces,
         )  # imported only with vertex contact
 
@@ -368,7 +368,7 @@ class SweepState(SolverState):
             p: positions (n, 3) [m] at which the sweep starts, without extrapolation.
             planes: planes of vertices, which act on both sides and replace the active contacts.
         """
-        from springbench.solvers.contact.half_space.packed_half_spaces import pack_contact_planes
+        from springbench.solvers.methods.vertex_block.packed_half_spaces import pack_contact_planes
 
         made = self._prepared
         self._restart_at(p)
