@@ -1,7 +1,7 @@
 """Offset geometric contact (OGC) for vertex block descent, by displacement bounds.
 
 A detection finds the contacts, and a ball around each vertex within which it cannot pass through anything
-(`springbench.solvers.contact.offset_detection`). Sweeps follow in which no vertex leaves its ball
+(`springbench.solvers.methods.vertex_block.offset_detection`). Sweeps follow in which no vertex leaves its ball
 (`springbench.solvers.methods.vertex_block.vbd_offset_sweeps`). Once a sweep truncates the displacements of more than
 `redetection_fraction` of the vertices, contacts are detected again. The first iterate is the prediction of inertia and
 forces, truncated likewise. There is neither a line search nor a test of collisions along displacements. Source: Chen et
@@ -28,11 +28,6 @@ from numpy.typing import NDArray
 from springbench.solvers.contact.broad_phase.candidate_cache import compute_roundoff_margin
 from springbench.solvers.contact.contact_potential import BarrierContact
 from springbench.solvers.contact.half_space.vertex_contact import without_vertex_contact
-from springbench.solvers.contact.offset_detection import (
-    OffsetCollisions,
-    OffsetSurface,
-    is_supported_contact,
-)
 from springbench.solvers.iteration import vertex_terms
 from springbench.solvers.iteration.idle_contact import skip_idle_contact
 from springbench.solvers.iteration.iterative_solver import IterativeSolver, SolverState
@@ -40,6 +35,11 @@ from springbench.solvers.iteration.solver_info import Citation, SolverInfo
 from springbench.solvers.jit.kernel_compilation import jit_inner, jit_kernel
 from springbench.solvers.linalg.memory import allocate_aligned
 from springbench.solvers.methods.vertex_block import vbd_offset_sweeps as kernels
+from springbench.solvers.methods.vertex_block.offset_detection import (
+    OffsetCollisions,
+    OffsetSurface,
+    is_supported_contact,
+)
 from springbench.solvers.methods.vertex_block.vbd import (
     PreparedVertexBlockDescent,
     SweepState,

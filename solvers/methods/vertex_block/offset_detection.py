@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from springbench.solvers.contact import offset_blocks
 from springbench.solvers.contact.broad_phase.candidate_cache import (
     CACHE_INFLATION,
     CachedCandidates,
@@ -23,7 +22,8 @@ from springbench.solvers.contact.collision_mesh import CollisionMesh
 from springbench.solvers.contact.collisions import EDGE_EDGE, allocate_collisions, build_collisions, pad_positions
 from springbench.solvers.contact.contact_potential import BarrierContact
 from springbench.solvers.contact.obstacle_mesh import ObstacleCollisionMesh
-from springbench.solvers.contact.offset_blocks import SurfaceAdjacency
+from springbench.solvers.methods.vertex_block import offset_blocks
+from springbench.solvers.methods.vertex_block.offset_blocks import SurfaceAdjacency
 from springbench.solvers.model.step_problem import Positions
 
 FloatArray = NDArray[np.float64]
