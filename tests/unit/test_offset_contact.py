@@ -24,13 +24,12 @@ from springbench.solvers.contact.collision_mesh import CollisionMesh
 from springbench.solvers.contact.collisions import Candidates, pad_positions
 from springbench.solvers.contact.contact_potential import BarrierContact, SelfContact
 from springbench.solvers.contact.potentials.barrier import compute_distances
-from springbench.solvers.contact.potentials.offset_activation import offset_force
 from springbench.solvers.jit.kernel_compilation import jit_kernel
 from springbench.solvers.methods.vertex_block.offset_blocks import SurfaceAdjacency, find_offset_contacts
 from springbench.solvers.methods.vertex_block.offset_detection import OffsetSurface
 from springbench.solvers.methods.vertex_block.vbd import VertexBlockDescent
 from springbench.solvers.methods.vertex_block.vbd_offset_contact import OffsetContactDescent, fill_row_entries
-from springbench.solvers.methods.vertex_block.vbd_offset_sweeps import OffsetContacts, add_offset_contacts
+from springbench.solvers.methods.vertex_block.vbd_offset_sweeps import OffsetContacts, add_offset_contacts, offset_force
 from springbench.solvers.model.step_problem import Positions, StopRule, Unsupported
 
 from tests.scene_builders import build_test_scene

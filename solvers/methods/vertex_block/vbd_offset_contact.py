@@ -8,12 +8,12 @@ forces, truncated likewise. There is neither a line search nor a test of collisi
 al. 2025, "Offset geometric contact", ACM TOG 44(4), with its parameters as defaults.
 
 The method takes radius, minimum distance, stiffness and friction from the contact effects of a scene, but not their
-barrier: its contacts have the activation of `springbench.solvers.contact.potentials.offset_activation`, each counts
-once, and pairs whose features are not in each other's offset blocks have none. So it does not minimise the objective
-of the step, and has no residual. Friction has the law of all other contact here
-(`springbench.solvers.contact.potentials.friction_law`); the paper has that of Li et al. 2020. Both are lagged by
-neglecting the derivatives of the normal force. While nothing is near, and in scenes without contact of surfaces, the
-method is that of `springbench.solvers.methods.vertex_block.vbd`, whose extrapolation is used there only.
+barrier: its contacts have the activation of `vbd_offset_sweeps.offset_force`, each counts once, and pairs whose
+features are not in each other's offset blocks have none. So it does not minimise the objective of the step, and has no
+residual. Friction has the law of all other contact here (`springbench.solvers.contact.potentials.friction_law`); the
+paper has that of Li et al. 2020. Both are lagged by neglecting the derivatives of the normal force. While nothing is
+near, and in scenes without contact of surfaces, the method is that of
+`springbench.solvers.methods.vertex_block.vbd`, whose extrapolation is used there only.
 """
 
 from __future__ import annotations

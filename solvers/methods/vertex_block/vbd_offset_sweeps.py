@@ -8,8 +8,8 @@ points of its features, with coefficients k_i in the distance vector d n, adds
 
     -k_i f(d) n + k_i w u,   k_i^2 (f'(d) nn' + w (I - nn')),   w = mu f/max(s, |u|)
 
-f: activation force (`contact.potentials.offset_activation`); u: tangential displacement since the start of the step; s:
-smoothing length (`contact.potentials.friction_law`). f and n are those of the current positions, so that friction lags
+f: activation force (`offset_force`); u: tangential displacement since the start of the step; s: smoothing length
+(`contact.potentials.friction_law`). f and n are those of the current positions, so that friction lags
 by no step; their derivatives are left out, as in the paper.
 """
 
@@ -27,7 +27,6 @@ from springbench.solvers.contact.geometry.distance import (
 )
 from springbench.solvers.contact.half_space.half_space_steps import solve_block
 from springbench.solvers.contact.potentials.friction_law import friction_stiffness, project_tangentially
-from springbench.solvers.contact.potentials.offset_activation import offset_force
 from springbench.solvers.jit.kernel_compilation import jit_closure, jit_inner, jit_kernel
 from springbench.solvers.methods.vertex_block.incident_elements import ElementKind, VertexFunctions
 from springbench.solvers.methods.vertex_block.vbd_packets import vbd_newton_step, vbd_vertex_model
@@ -67,6 +66,30 @@ class OffsetContacts(NamedTuple):
     centre: NDArray[np.float64]
     bound: NDArray[np.float64]
     step_start: NDArray[np.float64]
+
+
+@jit_inner
+def offset_force(d, radius):
+    """Return -g'(d) [m] and g''(d), per stiffness [N/m], of the two-stage activation.
+
+    It is quadratic at first contact, and logarithmic near zero:
+
+        g(d) = (r - d)^2/2                          for r/2 <= d < r,        0 beyond r
+               (r/2)^2 (1/2 - ln(2 d/r))            for 0 < d < r/2
+
+    Both parts meet with equal values, slopes and curvatures, which determines the factor and the point r/2. Source:
+    Chen et al. 2025, "Offset geometric contact", ACM TOG 44(4); ipctk has the same function as `TwoStageBarrier`.
+
+    Args:
+        d: distance [m], above 0.
+        radius: contact radius r [m].
+    """
+    if d >= radius:
+        return 0.0, 0.0
+    if 2.0 * d >= radius:
+        return radius - d, 1.0
+    factor = 0.25 * radius * radius
+    return factor / d, factor / (d * d)
 
 
 @jit_inner
