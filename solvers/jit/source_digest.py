@@ -289,12 +289,12 @@ def _parse_imports(source: str) -> set[str]:
 
 
 def _list_public_modules() -> Mapping[str, str]:
-    """Return the module of each public name of the top package, which imports them on first use."""
+    """Return the module of each public name, which is imported on first use."""
     return getattr(sys.modules.get(_TOP_PACKAGE), "_MODULE_OF", {})
 
 
 def _find_public_names(source: str, text: str) -> set[str]:
-    """Return the public names that a source outside this project uses as attributes of the top package."""
+    """Return the public names that a source outside this project uses."""
     return set() if _is_project_file(source) else _list_public_modules().keys() & _PUBLIC_NAME_PATTERN.findall(text)
 
 

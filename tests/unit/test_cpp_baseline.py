@@ -90,7 +90,7 @@ def test_a_program_that_ends_early_is_a_failed_run(echo: Path, tmp_path: Path):
         running.time_step_phases(101)
     with pytest.raises(RunFailed):
         running.time_step_phases(1)
-    running.kill()
+    running.kill_process()
 
 
 def test_exact_pins_are_not_supported(tmp_path: Path):

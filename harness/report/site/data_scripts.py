@@ -54,7 +54,7 @@ def write_json_script(path: Path, name: str, value: str) -> Path:
 
 
 def is_script_outdated(path: Path, sources: Iterable[Path], start: str = _CALL) -> bool:
-    """Return whether a script is missing, older than a source, or of another version of the page.
+    """Return whether a script is missing, older than a source, or of another version.
 
     Args:
         path: the script.
