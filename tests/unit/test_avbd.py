@@ -266,7 +266,11 @@ def test_a_false_residual_of_exact_lengths_is_found():
     """One that is a hundred times too small, and an early end by a tolerance that was not reached."""
     stated = build_first_problem(chain(4, mass=1.0))
     made = Avbd().prepare(stated.system)
-    for part, stop, said in ((1.0, StopRule(8), ""), (0.01, StopRule(8), "expected"), (1.0, StopRule(8, 1e-6), "tolerance")):
+    for part, stop, said in (
+        (1.0, StopRule(8), ""),
+        (0.01, StopRule(8), "expected"),
+        (1.0, StopRule(8, 1e-6), "tolerance"),
+    ):
         graded = AuditedSolver(_Claiming(made, part), Avbd(), {1})
         if said:
             with pytest.raises(RunFailed, match=said):
