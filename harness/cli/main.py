@@ -151,7 +151,7 @@ def run(
                 "scheduler": scheduler,
                 "workers": workers,
                 **context.obj,
-                "second --size": (size or [])[1:],
+                "size (more than one)": (size or [])[1:],
             },
         )
         raise typer.Exit(0 if is_accurate else 1)

@@ -84,9 +84,7 @@ class AuditedSolver(DelegatingSolver):
         initial_residual = self._stationarity.compute_initial_residual(problem)
         message, truth = f"{self._name}: reports a residual of {found.residual:.3g} J^(1/2)", reached * initial_residual
         if np.isnan(found.residual) and found.num_iterations:
-            raise RunFailed(
-                f"{message}; expected |Q^-1 grad g|_Q, which is {truth:.3g}; state `is_minimiser = False` otherwise"
-            )
+            raise RunFailed(f"{message}; expected |Q^-1 grad g|_Q, which is {truth:.3g}, or `is_minimiser = False`")
         claimed = RESIDUAL_SLACK * found.residual / initial_residual + round_off
         enough = (
             RESIDUAL_SLACK * max(stop.rtol or 0.0, stop.atol / initial_residual if initial_residual else 0.0)

@@ -2,7 +2,7 @@
 
 A source depends on itself and on the sources that its imports lead to, wherever in the file the imports stand. Imports
 are followed within this project, and within its own folder or package if the source lies elsewhere. A source elsewhere
-depends on the modules of the public names of `springbench` that it uses, except those of scripts. A source also
+depends on the modules of the public names of `springbench` that it uses, except those that scripts call. A source also
 depends on compiled-language files of the same name next to it, as `eigen_local_global.py` does on
 `eigen_local_global.cpp` and `eigen_local_global.hpp`. Installed libraries are identified by their versions.
 
@@ -110,7 +110,7 @@ _TYPE_CHECKING_BLOCK = re.compile(r"^if TYPE_CHECKING:\n(?:[ \t]+\S.*\n|\n)+", r
 """Imports for type checkers, which are never executed."""
 
 _SCRIPT_MODULE = f"{_TOP_PACKAGE}.harness.api"
-"""Module of the public names that scripts use: what a file runs is no part of what it defines."""
+"""Module of the functions that scripts call, such as `run_config`: no solver or effect of a user depends on them."""
 _PUBLIC_NAME_PATTERN = re.compile(rf"\b{_TOP_PACKAGE}\.(\w+)")
 _IMPORT_PATTERN = re.compile(
     r"^[ \t]*(?:from[ \t]+(?P<base>\.*[\w.]*)[ \t]+import[ \t]+(?P<names>\([^)]*\)|.*)|import[ \t]+(?P<whole>.+))", re.M
