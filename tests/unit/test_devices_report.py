@@ -110,11 +110,12 @@ def test_sides_are_compared_by_the_fastest_method_that_reached_the_tolerance() -
         return shared | {"method": method, "device": device, "seconds": seconds, "reason": reason}
 
     rows = [
-        time_row("vbd, float32", "H", 4.0),
-        time_row("vbd, float64", "H", 8.0),
-        time_row("newton-cg, float32", "H", 1.0, "max-iter"),
+        time_row("vbd, float32", "H, 132 multiprocessors", 4.0),
+        time_row("vbd, float64", "H, 132 multiprocessors", 8.0),
+        time_row("newton-cg, float32", "H, 132 multiprocessors", 1.0, "max-iter"),
         time_row("hybrid", None, 2.0),
     ]
     (found,) = compare_sides(rows)
-    assert (found["device_method"], found["processor_method"], found["time_ratio"]) == ("vbd, float32", "hybrid", 2.0)
+    assert (found["device"], found["time_ratio"]) == ("H", 2.0)
+    assert (found["device_method"], found["processor_method"]) == ("vbd, float32", "hybrid")
     assert compare_sides(rows[:3]) == []

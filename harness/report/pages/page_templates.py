@@ -135,8 +135,7 @@ class _PageFields:
         count = f"{about['runs']:,}" + (f" of {requested:,}" if requested else "")
         loads = [f"{load:.0f}" for load in about.get("load_average", ())]
         load = f", load {' to '.join(dict.fromkeys(loads))}" if loads else ""
-        record = f" {about['record']}" if "record" in about else ""
-        return f"Data: `{about['command']}`, {count} runs, {where}{load}, {date}, commit {commits}.{record}"
+        return f"Data: `{about['command']}`, {count} runs, {where}{load}, {date}, commit {commits}."
 
     def _add_panels(self, name: str, alt: str, title: str, panels: Sequence[FigurePanel], width: float) -> str:
         path = self.page.parent / PICTURE_FOLDER / f"{name}.png"
