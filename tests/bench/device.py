@@ -195,7 +195,7 @@ def main() -> None:
 def compare_sides(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Return a row for each size and tolerance that both sides reached: the fastest method of each, and the ratio.
 
-    `device` is its name, `time_ratio` the time on it over that on the processor, copies included. XPBD has no tolerance.
+    `time_ratio` is the time on the device over that on the processor, copies included. XPBD has no tolerance.
     """
     fastest: dict[tuple[str, int, float | None, bool], dict[str, Any]] = {}
     for row in rows:

@@ -1,6 +1,7 @@
 """What a second thread saves in an iteration of Newton's method, and how that compares with MKL PARDISO.
 
-    python -m tests.bench.factor_threads [--sizes 32 64 128 256] [--rounds 9]
+    python -m tests.bench.factor_threads [--sizes 32 64 128 256 400] [--rounds 9]
+        [--publish results/published/factor-threads]
 
 An iteration is the gradient, the Hessian, its factorisation, the solve, and the change of the objective, on a sheet
 that is stretched by 5 %, so that the Hessian is positive definite. PARDISO, with the optional dependency `pardiso`,
@@ -14,6 +15,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable
 from os import getloadavg
+from pathlib import Path
 from time import perf_counter, sleep
 from typing import Any
 
@@ -29,6 +31,9 @@ from springbench.solvers.objective.fixed_objective import FixedObjective
 from springbench.solvers.objective.step_objective import StepObjective
 
 from tests.bench.gates import sheet
+from tests.bench.scripted_study import describe_provenance, publish_rows
+
+SCENE = Path(__file__).parents[2] / "configs" / "scenes" / "hanging-cloth.yaml"
 
 PAUSE = 0.3
 """Seconds between both programs: Intel's waiting threads spin for 0.2."""
@@ -92,43 +97,66 @@ def _measure(works: list[Callable[[], object]], rounds: int) -> np.ndarray:
     return seconds
 
 
-def _ratio(ratios: np.ndarray) -> str:
-    low, middle, high = np.quantile(ratios, (0.25, 0.5, 0.75))
-    return f"{middle:.2f} ({low:.2f} to {high:.2f})"
+def _quartiles(name: str, ratios: np.ndarray) -> dict[str, float]:
+    low, middle, high = np.quantile(ratios, (0.25, 0.5, 0.75)).tolist()
+    return {name: middle, f"{name}_low": low, f"{name}_high": high}
 
 
-def measure(size: int, rounds: int) -> list[str]:
-    """The row of a size."""
+def measure(size: int, rounds: int) -> dict[str, float]:
+    """Measure a size: median milliseconds, and ratios of rounds with their quartiles; without PARDISO only ours."""
     iterate, step, p = newton_iteration(size)
 
     def by_threads(threads: int) -> Callable[[], object]:
         return lambda: (numba.set_num_threads(threads), iterate())
 
     ours = _measure([by_threads(1), by_threads(2)], rounds)
-    row = [str(size), *(f"{1e3 * s:.2f}" for s in np.median(ours, axis=0)), _ratio(ours[:, 0] / ours[:, 1])]
+    one, two = np.median(ours, axis=0).tolist()
+    row = {"size": size, "one_thread_ms": 1e3 * one, "two_threads_ms": 1e3 * two}
+    row |= _quartiles("thread_ratio", ours[:, 0] / ours[:, 1])
     sleep(PAUSE)
     theirs = [work for k in (1, 2) if (work := pardiso_factorisation(step, p, k))]
-    if not theirs:
-        return [*row, "-", "-", "-"]
-    seconds = _measure(theirs, rounds)
-    sleep(PAUSE)
-    medians = np.median(seconds, axis=0)
-    return [*row, *(f"{1e3 * s:.2f}" for s in medians), _ratio(seconds[:, 1] / np.median(ours[:, 1]))]
+    if theirs:
+        seconds = _measure(theirs, rounds)
+        sleep(PAUSE)
+        pardiso_one, pardiso_two = np.median(seconds, axis=0).tolist()
+        row |= {"pardiso_one_thread_ms": 1e3 * pardiso_one, "pardiso_two_threads_ms": 1e3 * pardiso_two}
+        row |= _quartiles("pardiso_ratio", seconds[:, 1] / two)
+    return row
+
+
+def _list_cells(row: dict[str, float]) -> list[str]:
+    def format_ratio(name: str) -> str:
+        return f"{row[name]:.2f} ({row[f'{name}_low']:.2f} to {row[f'{name}_high']:.2f})" if name in row else "-"
+
+    def format_time(name: str) -> str:
+        return f"{row[name]:.2f}" if name in row else "-"
+
+    return [
+        f"{row['size']}",
+        *(format_time(name) for name in ("one_thread_ms", "two_threads_ms")),
+        format_ratio("thread_ratio"),
+        *(format_time(name) for name in ("pardiso_one_thread_ms", "pardiso_two_threads_ms")),
+        format_ratio("pardiso_ratio"),
+    ]
 
 
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--sizes", type=int, nargs="+", default=[32, 64, 128, 256])
+    parser.add_argument("--sizes", type=int, nargs="+", default=[32, 64, 128, 256, 400])
     parser.add_argument("--rounds", type=int, default=9)
+    parser.add_argument("--publish", type=Path, help="folder of a published study")
     given = parser.parse_args()
+    begin, rows = describe_provenance(), list[dict[str, float]]()
     print(f"{describe_machine().cpu}; load {getloadavg()[0]:.1f}; times in ms")
     columns = "size", "1 thread", "2 threads", "ratio", "PARDISO, 1", "PARDISO, 2", "PARDISO / ours, 2"
     table = Table(*columns, box=SIMPLE_HEAD)
     with limit_threads(2):
         for size in given.sizes:
-            table.add_row(*measure(size, given.rounds))
+            rows.append(measure(size, given.rounds))
+            table.add_row(*_list_cells(rows[-1]))
     Console(width=120).print(table)
+    publish_rows(given.publish, SCENE, "python -m tests.bench.factor_threads", rows, begin)
 
 
 if __name__ == "__main__":

@@ -1,26 +1,26 @@
 """What contact costs while nothing is near: steps of cloth with contact over steps without.
 
-    python -m tests.bench.idle_contact [--sizes 33 64 128] [--solvers hybrid newton] [--scenes cloth flag]
-    python -m tests.bench.idle_contact --broad-phases [--sizes 33 64 128] [--scenes cloth flag]
+    python -m tests.bench.idle_contact [--tables steps broad-phases] [--sizes 33 64 128] [--solvers hybrid newton]
+        [--scenes cloth flag] [--publish results/published/idle-contact]
 
-The swinging cloth and the flag are simulated to a relative residual of 1e-6: with self-contact, with surface contact to
-a plane 5 m below, and without. Both simulations advance one step each in turn on one thread, in several rounds. A cell
-is the ratio of the processor times of all steps after the first two, up to the first in which contact acts. Of each
-step the least time of the rounds counts. The number of these steps follows.
-
-The second command compares ways to certify that a step with self-contact is free of collisions and ends without active
-pairs: affine clusters, the hierarchy of boxes, and a list of the pairs within a skin, which is made again where two
-vertices may have moved relative to each other by more than the skin. The best of several skins counts.
+steps           The swinging cloth and the flag are simulated to a relative residual of 1e-6: with self-contact, with
+                surface contact to a plane 5 m below, and without. Both simulations advance one step each in turn on one
+                thread, in several rounds. The ratio is that of the processor times of all steps after the first two, up
+                to the first in which contact acts. Of each step the least time of the rounds counts.
+broad-phases    Three ways to certify that a step with self-contact is free of collisions and ends without active pairs:
+                affine clusters, the hierarchy of boxes, and a list of the pairs within a skin, which is made again
+                where two vertices may have moved relative to each other by more than the skin. The best of several
+                skins counts.
 """
 
 from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
-from itertools import pairwise
+from itertools import pairwise, product
 from pathlib import Path
 from time import thread_time
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from rich.box import SIMPLE_HEAD
@@ -42,6 +42,8 @@ from springbench.solvers.contact.potentials.barrier import compute_distances
 from springbench.solvers.methods.newton.hybrid_newton import HybridNewton
 from springbench.solvers.model.step_problem import Positions, StopRule
 from springbench.solvers.registry import SOLVERS, load_target
+
+from tests.bench.scripted_study import describe_provenance, publish_rows
 
 SCENES = Path(__file__).parents[2] / "configs" / "scenes"
 CLOTHS = {"cloth": "hanging-cloth.yaml", "flag": "flag-in-wind.yaml"}
@@ -163,40 +165,60 @@ def _largest_relative_displacement(p: Positions, q: Positions) -> float:
     return 2.0 * float(np.linalg.norm(d - d.mean(axis=0), axis=1).max())
 
 
+def measure_steps(options: argparse.Namespace) -> list[dict[str, Any]]:
+    """Measure the table `steps` and print it; a row for each ratio."""
+    table = Table("scene", "a side", "solver", "step without, ms", *options.contacts, box=SIMPLE_HEAD)
+    table.title = f"a step with contact that is idle over one without; {describe_machine().cpu}"
+    rows = list[dict[str, Any]]()
+    for cloth, size, solver in product(options.scenes, options.sizes, options.solvers):
+        cells, without = list[str](), np.nan
+        for name in options.contacts:
+            ratio, count, without = measure_step_ratio(
+                cloth, CONTACTS[name], size, solver, options.frames, options.rounds
+            )
+            cells.append(f"{ratio:.3f} ({count})")
+            columns = {"kind": "step", "scene": cloth, "size": size, "solver": solver, "contact": name}
+            rows.append(columns | {"ratio": ratio, "num_steps": count, "milliseconds": 1e3 * without})
+        table.add_row(cloth, str(size), solver, f"{1e3 * without:.3g}", *cells)
+    Console(width=120).print(table)
+    return rows
+
+
+def measure_certificates(options: argparse.Namespace) -> list[dict[str, Any]]:
+    """Measure the table `broad-phases` and print it; a row for each scene, size and method."""
+    table = Table("scene", "a side", "clusters", "boxes", "list", "skin", box=SIMPLE_HEAD)
+    table.title = f"certificate of a step with self-contact, in ms; {describe_machine().cpu}"
+    rows = list[dict[str, Any]]()
+    for cloth, size in product(options.scenes, options.sizes):
+        found = measure_broad_phases(cloth, size, options.frames)
+        table.add_row(cloth, str(size), *(f"{x:.3g}" for x in found))
+        columns = {"kind": "broad-phase", "scene": cloth, "size": size, "contact": "self-contact"}
+        for method in ("clusters", "boxes", "pair_list"):
+            rows.append(columns | {"method": method.replace("_", " "), "milliseconds": getattr(found, method)})
+    Console(width=120).print(table)
+    return rows
+
+
+TABLES = {"steps": measure_steps, "broad-phases": measure_certificates}
+
+
 def main() -> None:
-    """Print the table."""
+    """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--tables", nargs="+", choices=TABLES, default=list(TABLES))
     parser.add_argument("--sizes", type=int, nargs="+", default=[33, 64, 128])
     parser.add_argument("--solvers", nargs="+", default=["hybrid", "newton"])
     parser.add_argument("--scenes", nargs="+", choices=CLOTHS, default=list(CLOTHS))
     parser.add_argument("--contacts", nargs="+", choices=CONTACTS, default=list(CONTACTS))
     parser.add_argument("--frames", type=int, default=16)
     parser.add_argument("--rounds", type=int, default=3)
-    parser.add_argument("--broad-phases", action="store_true")
+    parser.add_argument("--publish", type=Path, help="folder of a published study")
     options = parser.parse_args()
-    if options.broad_phases:
-        table = Table("scene", "a side", "clusters", "boxes", "list", "skin", box=SIMPLE_HEAD)
-        table.title = f"certificate of a step with self-contact, in ms; {describe_machine().cpu}"
-        with limit_threads(1):
-            for cloth in options.scenes:
-                for size in options.sizes:
-                    found = measure_broad_phases(cloth, size, options.frames)
-                    table.add_row(cloth, str(size), *(f"{x:.3g}" for x in found))
-        Console(width=120).print(table)
-        return
-    table = Table("scene", "a side", "solver", "step without, ms", *options.contacts, box=SIMPLE_HEAD)
-    table.title = f"a step with contact that is idle over one without; {describe_machine().cpu}"
+    begin = describe_provenance()
     with limit_threads(1):
-        for cloth in options.scenes:
-            for size in options.sizes:
-                for solver in options.solvers:
-                    cells, without = list[str](), np.nan
-                    for name in options.contacts:
-                        given = CONTACTS[name], size, solver, options.frames, options.rounds
-                        ratio, count, without = measure_step_ratio(cloth, *given)
-                        cells.append(f"{ratio:.3f} ({count})")
-                    table.add_row(cloth, str(size), solver, f"{1e3 * without:.3g}", *cells)
-    Console(width=120).print(table)
+        rows = [row for name in options.tables for row in TABLES[name](options)]
+    config = SCENES / CLOTHS[options.scenes[0]]
+    publish_rows(options.publish, config, "python -m tests.bench.idle_contact", rows, begin)
 
 
 if __name__ == "__main__":

@@ -1,10 +1,11 @@
 """Cost of large meshes: processor time, memory and residual of the runs of a sweep, once each.
 
-    python -m tests.bench.large [CONFIG] [--only WORDS] [--sizes SIZE ...] [--publish results/published/growth-large]
+    python -m tests.bench.large [CONFIG] [--only WORDS ...] [--sizes SIZE ...]
+        [--publish results/published/growth-large]
     python -m tests.bench.large configs/contact.yaml --last-step --threads 2
 
-CONFIG is `configs/growth-large.yaml` if left out; WORDS are of a run's scene, size, solver and first guess, in this
-order, as in "flag-in-wind 122". Each run has a process of its own, whose peak of memory includes the reference
+CONFIG is `configs/growth-large.yaml` if left out; WORDS are those of a run's scene, size, solver and first guess, in
+this order, as in "flag-in-wind 122". Each run has a process of its own, whose peak of memory includes the reference
 evaluator. Preparing and steps are timed separately, after one iteration that warms up; a step's time is the mean over
 frames, or with `--last-step` that of the last one, e.g. the third in contact. The residual is the largest
 |Q^-1 grad g|_Q over the frames, relative to that at the frame's current positions. `growth` is the exponent of the
@@ -86,7 +87,7 @@ def main() -> None:
     """Print a line for each run when it is done."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("config", nargs="?", type=Path, default=GROWTH, metavar="CONFIG")
-    parser.add_argument("--only", default="", metavar="WORDS")
+    parser.add_argument("--only", nargs="*", default=[""], metavar="WORDS", help="runs with any of these words")
     parser.add_argument("--sizes", nargs="*", type=int, help="mesh sizes; all by default")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--last-step", action="store_true", help="measure the last frame alone")
@@ -97,7 +98,7 @@ def main() -> None:
     print("run | vertices | prepare s | step s | wall s | iterations | residual | peak GiB | growth")
     for run in load_sweep(options.config).list_runs():
         title = f"{run.title} {run.initial_guess}"
-        if options.only not in title or run.size not in (options.sizes or [run.size]):
+        if not any(words in title for words in options.only) or run.size not in (options.sizes or [run.size]):
             continue
         with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as alone:
             first = run.frames - 1 if options.last_step else 0

@@ -1,16 +1,13 @@
 """What nested dissection costs and saves, compared with minimum degree and with the preparation of CHOLMOD.
 
     python -m tests.bench.ordering [--sizes 64 128 256] [--solids 12 20] [--rounds 5]
+        [--publish results/published/ordering]
 
 Sheets have the system matrix of springs along sides and diagonals, solids springs between all neighbours. Minimum
 degree is SuperLU's (of A' + A), whose order is analysed like ours. A factorisation is Newton's, with a solve, in blocks
 of 3 x 3; a solve is that of local-global. Preparation is ordering, symbolic analysis, and the factor for local-global;
 that of CHOLMOD, through cholespy, orders by AMD. Times are the least of the rounds, in ms: processor time with one
 thread, wall time with two.
-
-Nested dissection is used because minimum degree costs more where factorisations are repeated. It has 8 % more entries
-and 22 % more flops on a sheet of 64 a side, 7 % and 21 % at 128, 14 % and 45 % on a solid of 12. Preparation took 19
-and 82 ms on the two sheets, CHOLMOD's 19 and 103, on a busy EPYC.
 """
 
 from __future__ import annotations
@@ -18,7 +15,9 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable
 from os import getloadavg
+from pathlib import Path
 from time import perf_counter, thread_time
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,8 +34,11 @@ from springbench.solvers.linalg.cholesky.symbolic_factorisation import SymbolicF
 from springbench.solvers.linalg.direct_solvers import SimplicialCholesky
 
 from tests.bench.gates import sheet
+from tests.bench.scripted_study import describe_provenance, publish_rows
 from tests.bench.solves import system_matrix
 from tests.network_matrices import grid_matrix
+
+SCENE = Path(__file__).parents[2] / "configs" / "scenes" / "hanging-cloth.yaml"
 
 
 def minimum_degree_order(Q: csr_array) -> NDArray[np.int32]:
@@ -65,43 +67,43 @@ def least(work: Callable[[], object], rounds: int, clock: Callable[[], float]) -
     return 1e3 * min(seconds)
 
 
-def by_threads(work: Callable[[], object], rounds: int) -> list[str]:
-    """The times of a work with one and two threads."""
-    out = []
-    for threads, clock in ((1, thread_time), (2, perf_counter)):
-        with limit_threads(threads):
-            out.append(f"{least(work, rounds, clock):.2f}")
+def measure_by_threads(name: str, work: Callable[[], object], rounds: int) -> dict[str, float]:
+    """Return the times of a work with one and two threads [ms]."""
+    out = dict[str, float]()
+    for threads, clock in (("one", thread_time), ("two", perf_counter)):
+        with limit_threads(1 if threads == "one" else 2):
+            out[f"{name}_{threads}_ms"] = least(work, rounds, clock)
     return out
 
 
-def order_row(Q: csr_array, order: NDArray[np.int32], rounds: int) -> list[str]:
-    """Fill, operations and times of an order."""
+def measure_order(Q: csr_array, order: NDArray[np.int32], rounds: int) -> dict[str, float]:
+    """Return fill, operations and times of an order."""
     symbolic = analyse_with_order(np.asarray(Q.indptr, np.int64), np.asarray(Q.indices, np.int32), order)
     newton = BlockCholesky(Q, symbolic_factor=symbolic)
     blocks, b = newton_blocks(Q), np.random.default_rng(0).normal(size=(Q.shape[0], 3))
     solver, out = SupernodalCholesky(Q, symbolic_factor=symbolic), np.empty_like(b)
-    return [
-        f"{symbolic.nonzeros:,}",
-        f"{newton.flops:.3g}",
-        *by_threads(lambda: newton.factorise_and_solve(blocks, b), rounds),
-        *by_threads(lambda: solver.solve(b, out), 4 * rounds),
-    ]
+    return {
+        "nonzeros": symbolic.nonzeros,
+        "flops": float(newton.flops),
+        **measure_by_threads("factor", lambda: newton.factorise_and_solve(blocks, b), rounds),
+        **measure_by_threads("solve", lambda: solver.solve(b, out), 4 * rounds),
+    }
 
 
-def preparation_row(Q: csr_array, rounds: int) -> list[str]:
-    """Times of the parts of our preparation, and of all of CHOLMOD's."""
+def measure_preparation(Q: csr_array, rounds: int) -> dict[str, float]:
+    """Return the times of the parts of our preparation, of their sum, and of all of CHOLMOD's [ms]."""
     pointers, neighbours = np.asarray(Q.indptr, np.int64), np.asarray(Q.indices, np.int32)
     order = nested_dissection_order(pointers, neighbours)
     symbolic: SymbolicFactor = analyse_with_order(pointers, neighbours, order)
-    works: list[Callable[[], object]] = [
-        lambda: nested_dissection_order(pointers, neighbours),
-        lambda: analyse_with_order(pointers, neighbours, order),
-        lambda: SupernodalCholesky(Q, symbolic_factor=symbolic),
-        lambda: SimplicialCholesky(Q),
-    ]
+    works: dict[str, Callable[[], object]] = {
+        "ordering_ms": lambda: nested_dissection_order(pointers, neighbours),
+        "symbolic_ms": lambda: analyse_with_order(pointers, neighbours, order),
+        "numeric_ms": lambda: SupernodalCholesky(Q, symbolic_factor=symbolic),
+        "cholmod_ms": lambda: SimplicialCholesky(Q),
+    }
     with limit_threads(1):
-        times = [least(work, rounds, thread_time) for work in works]
-    return [*(f"{t:.1f}" for t in times[:3]), f"{sum(times[:3]):.1f}", f"{times[3]:.1f}"]
+        times = {name: least(work, rounds, thread_time) for name, work in works.items()}
+    return times | {"prepare_ms": times["ordering_ms"] + times["symbolic_ms"] + times["numeric_ms"]}
 
 
 def main() -> None:
@@ -110,7 +112,9 @@ def main() -> None:
     parser.add_argument("--sizes", type=int, nargs="*", default=[64, 128, 256])
     parser.add_argument("--solids", type=int, nargs="*", default=[12, 20])
     parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--publish", type=Path, help="folder of a published study")
     given = parser.parse_args()
+    begin, rows = describe_provenance(), list[dict[str, Any]]()
     print(f"{describe_machine().cpu}; load {getloadavg()[0]:.1f}; times in ms")
     matrices = {f"sheet {n}": system_matrix(sheet(n)) for n in given.sizes}
     matrices |= {f"solid {n}": grid_matrix(n, n, n) for n in given.solids}
@@ -118,12 +122,19 @@ def main() -> None:
     parts = Table("matrix", "ordering", "symbolic", "factor", "all", "CHOLMOD", box=SIMPLE_HEAD)
     for name, Q in matrices.items():
         dissected = nested_dissection_order(np.asarray(Q.indptr, np.int64), np.asarray(Q.indices, np.int32))
-        orders.add_row(name, "nested dissection", *order_row(Q, dissected, given.rounds))
-        orders.add_row("", "minimum degree", *order_row(Q, minimum_degree_order(Q), given.rounds))
-        parts.add_row(name, *preparation_row(Q, given.rounds))
+        for order, found in (("nested dissection", dissected), ("minimum degree", minimum_degree_order(Q))):
+            row = measure_order(Q, found, given.rounds)
+            rows.append({"kind": "order", "matrix": name, "order": order} | row)
+            times = (f"{row[f'{work}_{threads}_ms']:.2f}" for work in ("factor", "solve") for threads in ("one", "two"))
+            orders.add_row(name, order, f"{row['nonzeros']:,}", f"{row['flops']:.3g}", *times)
+        row = measure_preparation(Q, given.rounds)
+        rows.append({"kind": "preparation", "matrix": name} | row)
+        columns = ("ordering_ms", "symbolic_ms", "numeric_ms", "prepare_ms", "cholmod_ms")
+        parts.add_row(name, *(f"{row[column]:.1f}" for column in columns))
     console = Console(width=120)
     console.print(orders)
     console.print(parts)
+    publish_rows(given.publish, SCENE, "python -m tests.bench.ordering", rows, begin)
 
 
 if __name__ == "__main__":

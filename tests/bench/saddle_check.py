@@ -1,6 +1,7 @@
 """What the check for saddles takes of a step's time, and in how many steps a bound makes it unnecessary.
 
     python -m tests.bench.saddle_check [SCENE:SIZE ...] [--solver lbfgs] [--frames 30] [--rtol 1e-6]
+        [--publish results/published/saddle-check]
 
 Each step is solved and its end point checked, one after the other, three times; the least processor time of each
 counts. The share is that of the check in the solve, which contains it.
@@ -14,6 +15,7 @@ from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from time import thread_time
+from typing import Any
 from unittest.mock import patch
 
 import numpy as np
@@ -30,6 +32,8 @@ from springbench.solvers.model.step_problem import StopRule
 from springbench.solvers.objective.fixed_objective import FixedObjective
 from springbench.solvers.registry import SOLVERS, load_target
 
+from tests.bench.scripted_study import describe_provenance, publish_rows
+
 SCENES = Path(__file__).parents[2] / "configs" / "scenes"
 NAMES = ("hanging-cloth:33", "chain:21", "curtain:24", "flag-in-wind:24", "balloon:12")
 ROUNDS = 3
@@ -39,8 +43,8 @@ class SearchStarted(Exception):
     """The bound did not suffice."""
 
 
-def measure_shares(name: str, solver: str, frames: int, stop: StopRule) -> list[str]:
-    """The row of a scene: steps, iterations, and the check's share of the time."""
+def measure_shares(name: str, solver: str, frames: int, stop: StopRule) -> dict[str, Any]:
+    """Measure a scene: its steps, iterations, and the check's share of the time without the first step."""
     scene, _, size = name.partition(":")
     spec = load_scene(SCENES / f"{scene}.yaml")
     made = build_scene(spec, int(size or spec.default_size or 0))
@@ -64,11 +68,12 @@ def measure_shares(name: str, solver: str, frames: int, stop: StopRule) -> list[
                 step.problem, step.solution.positions, step.num_iterations
             )
             bounded += 1
-    middle, most = np.median(shares[1:]), max(shares[1:])
-    return [
-        f"{scene} {size}", str(len(shares)), f"{np.median(iterations):.0f}", f"{1e3 * np.median(seconds):.2f}",
-        str(bounded), str(saddles), f"{middle:.1%}", f"{most:.1%}",
-    ]  # fmt: skip
+    return {
+        "scene": f"{scene} {size}", "solver": solver, "num_steps": len(shares),
+        "num_iterations": float(np.median(iterations)), "milliseconds": 1e3 * float(np.median(seconds)),
+        "num_bounded_steps": bounded, "num_saddles": saddles,
+        "share": float(np.median(shares[1:])), "max_share": max(shares[1:]),
+    }  # fmt: skip
 
 
 def _seconds(call: Callable[[], object]) -> float:
@@ -84,13 +89,21 @@ def main() -> None:
     parser.add_argument("--solver", default="lbfgs")
     parser.add_argument("--frames", type=int, default=30)
     parser.add_argument("--rtol", type=float, default=1e-6)
+    parser.add_argument("--publish", type=Path, help="folder of a published study")
     given = parser.parse_args()
+    begin, rows = describe_provenance(), list[dict[str, Any]]()
     columns = "scene", "steps", "iterations", "ms", "by the bound", "saddles", "share", "at most"
     table = Table(*columns, box=SIMPLE_HEAD)
     with limit_threads(1):
         for name in given.scenes:
-            table.add_row(*measure_shares(name, given.solver, given.frames, StopRule(3000, given.rtol)))
+            rows.append(found := measure_shares(name, given.solver, given.frames, StopRule(3000, given.rtol)))
+            table.add_row(
+                found["scene"], f"{found['num_steps']}", f"{found['num_iterations']:.0f}",
+                f"{found['milliseconds']:.2f}", f"{found['num_bounded_steps']}", f"{found['num_saddles']}",
+                f"{found['share']:.1%}", f"{found['max_share']:.1%}",
+            )  # fmt: skip
     Console(width=120).print(table)
+    publish_rows(given.publish, SCENES / "hanging-cloth.yaml", "python -m tests.bench.saddle_check", rows, begin)
 
 
 if __name__ == "__main__":
