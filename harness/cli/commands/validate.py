@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import count
 from pathlib import Path
 from time import monotonic
 from typing import Annotated, Any
@@ -21,6 +20,7 @@ def validate(
 
     The exit code is 1 if the discretisation does not explain the error of a closed form.
     """
+    from springbench.harness.execution.progress_display import UNIT_COST, RemainingTime, format_remaining
     from springbench.harness.experiments.validation.validation_study import (
         UNEXPLAINED,
         list_case_names,
@@ -34,13 +34,16 @@ def validate(
             raise InputError(f"--case: got {name!r}; expected {format_allowed_names(name, known)}")
     if output.exists() and not output.is_dir():
         raise InputError(f"--output: {output} is no folder; give the name of one")
-    cases, began = case or known, monotonic()
-    total, numbers = len(cases), count()
+    cases = case or known
+    pace, began = RemainingTime([UNIT_COST] * len(cases)), list[float]()
 
     def announce_case(name: str) -> None:
-        done = next(numbers)
-        left = f", {(monotonic() - began) * (total / done - 1.0):.0f} s left" if 2 * done >= total else ""
-        print_message(f"{name} ... ({done + 1} of {total}{left})")
+        now = monotonic()
+        if began:
+            pace.record_run(UNIT_COST, now - began[-1])
+        title = f"[{len(began)}/{len(cases)}] {name}"
+        print_message("; ".join(filter(None, (title, format_remaining(pace.estimate_seconds())))))
+        began.append(now)
 
     rows = validate_solver(_create_solver(solver), cases, announce_case)
     _print_table(rows)
