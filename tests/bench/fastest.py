@@ -1,17 +1,21 @@
-"""How many times as long as the fastest of all methods one of them takes, by frozen step and accuracy.
+"""Measure the time of a method relative to that of the fastest other method, by step snapshot and accuracy.
 
-    ratio = q(t) / min_m q(t_m)     q the median over the rounds, m the other methods
+    ratio = median(t) / min_m median(t_m)     medians over the rounds, minimum over the other methods m
 
     python -m tests.bench.fastest [CONFIG] [--solver hybrid] [--only WORDS] [--rounds 15] [--measure error]
 
-The steps, the first guesses and the methods are those of an accuracy config. An accuracy is a gap,
-(g - g*)/(g0 - g*), g* of the lowest minimum known, or an error, the largest distance of a vertex from its place in that
-minimum over the largest there at the step's start, and is reached with the first iterate that has it. A first pass
-grades all iterates; then all that may be the fastest take turns in one process, round after round, with a clock of the
-thread's own processor time, and their results are not used. The interval contains 95 % of the ratios of rounds that
-were drawn with replacement. A ratio whose interval reaches above the first of LIMITS is marked by >, where the step
-takes so long that it counts; `inf` is one that is not reached. `configs/fastest.yaml` has other steps than
-`configs/accuracy.yaml`, and by those of `configs/unseen.yaml` nothing of any solver was chosen.
+The steps, the initial guesses and the methods are those of an accuracy config. An accuracy is an upper bound of one of
+two measures, where g is the objective:
+
+    gap      (g - g*)/(g0 - g*), relative to the lowest known minimum
+    error    largest distance of a vertex from its position in that minimum, over the same distance at the step's start
+
+A method reaches an accuracy with its first iterate that satisfies it. A first pass evaluates all iterates. The methods
+that may be the fastest are then timed interleaved in one process, for several rounds, by the processor time of the
+thread and without evaluation. The interval is a bootstrap interval: it contains 95 % of the ratios of resampled rounds.
+The mark > denotes a ratio whose interval exceeds the first of LIMITS in a step that takes at least MIN_COUNTED_SECONDS;
+`inf` denotes an accuracy that the method does not reach. `configs/fastest.yaml` has other steps than
+`configs/accuracy.yaml`. The steps of `configs/unseen.yaml` were not used to choose any part of a solver.
 """
 
 from __future__ import annotations
@@ -41,26 +45,30 @@ from tests.bench.scripted_study import describe_provenance, publish_rows
 ROOT = Path(__file__).resolve().parents[2]
 TARGETS = {"gap": (1e-3, 1e-4, 1e-6), "error": (1e-3, 1e-6)}
 LIMITS = (1.25, 1.6)
-"""Ratios of which the shares of accuracies within them are stated."""
-COUNTS = 2e-4
-"""Seconds of the fastest method's, below which a step counts for nothing."""
-HOPELESS = 3.0
-"""Times the least time of the first pass, from which on a method takes no turns."""
-DRAWS, SHARE = 2000, 0.95
+"""Ratios for which the number of accuracies within them is printed."""
+MIN_COUNTED_SECONDS = 2e-4
+"""Time of the fastest method [s], above which an accuracy is included in these numbers."""
+MAX_FIRST_PASS_RATIO = 3.0
+"""A method is timed if its first-pass time is within this multiple of the least, for at least one accuracy."""
+NUM_RESAMPLES, CONFIDENCE = 2000, 0.95
 
 
 class CandidateSolve(NamedTuple):
-    """A method on a step: its name, what solves, after how many iterations it is at which gap, and seconds of that."""
+    """A method that is prepared for a step, and its first pass.
+
+    name: of the solver; num_iterations, seconds: needed to reach each accuracy, by accuracy; without those that the
+    method does not reach.
+    """
 
     name: str
     prepared: PreparedSolver
-    needs: dict[float, int]
+    num_iterations: dict[float, int]
     seconds: dict[float, float]
 
 
 @dataclass(frozen=True, slots=True)
-class Ratio:
-    """One accuracy of a step: the fastest method's name and time [s], the ratio to it, and its interval."""
+class TimeRatio:
+    """Result for one accuracy of a step: the fastest method, its time [s], the ratio, and the ratio's interval."""
 
     step: str
     target: float
@@ -71,13 +79,16 @@ class Ratio:
     high: float
 
     @property
-    def counts(self) -> bool:
-        """Whether the step takes so long."""
-        return self.seconds > COUNTS
+    def is_counted(self) -> bool:
+        """Whether the fastest method takes more than MIN_COUNTED_SECONDS."""
+        return self.seconds > MIN_COUNTED_SECONDS
 
 
-def steps(config: Path, only: str) -> Iterator[tuple[SnapshotEvaluation, list[CurveSpec]]]:
-    """The frozen steps of a config whose words are among their names, each once, and who is to solve them."""
+def load_steps(config: Path, only: str) -> Iterator[tuple[SnapshotEvaluation, list[CurveSpec]]]:
+    """Yield each step snapshot of a config once, with the specifications of the methods that solve it.
+
+    only: words that the title and the snapshot's name contain.
+    """
     store = open_reference_store(ROOT / "results")
     options: dict[tuple[str, str, str | int], list[CurveSpec]] = {}
     for spec in load_accuracy(config).curves:
@@ -91,8 +102,8 @@ def steps(config: Path, only: str) -> Iterator[tuple[SnapshotEvaluation, list[Cu
                 yield step, specs
 
 
-def grading(step: SnapshotEvaluation, problem: StepProblem, measure: str) -> Callable[[Positions], float]:
-    """Function that returns the gap or the error of positions."""
+def build_measure(step: SnapshotEvaluation, problem: StepProblem, measure: str) -> Callable[[Positions], float]:
+    """Return the function that computes the gap or the error of positions."""
     lowest, system = step.known_minima.lowest_minimum, problem.system
     if measure == "error":
         start = compute_vertex_distances(system, problem.current_positions, lowest.positions)[0]
@@ -102,139 +113,154 @@ def grading(step: SnapshotEvaluation, problem: StepProblem, measure: str) -> Cal
 
 
 def build_candidate(
-    spec: CurveSpec, problem: StepProblem, graded: Callable[[Positions], float], targets: Sequence[float]
+    spec: CurveSpec, problem: StepProblem, compute_measure: Callable[[Positions], float], targets: Sequence[float]
 ) -> CandidateSolve | None:
-    """The first pass of a method, up to the last of the accuracies; None where it takes no such scene."""
+    """Run the first pass of a method until it reaches all accuracies; return None if the scene is unsupported."""
     try:
         prepared = load_target(SOLVER_TABLE[spec.solver.name])(**spec.solver.parameters).prepare(problem.system)
         next(prepared.iterates(problem))  # compiles
     except Unsupported:
         return None
-    needs, seconds = dict[float, int](), dict[float, float]()
+    num_iterations, seconds = dict[float, int](), dict[float, float]()
     iterates, spent = prepared.iterates(problem), 0.0
     for number in range(1, spec.max_iterations + 1):
         began = thread_time()
         p = next(iterates)
         spent += thread_time() - began
-        left = graded(p)
+        remaining = compute_measure(p)
         for target in targets:
-            if left <= target and target not in needs:
-                needs[target], seconds[target] = number, spent
-        if len(needs) == len(targets) or spent > spec.measurement.time_limit or not np.isfinite(left):
+            if remaining <= target and target not in num_iterations:
+                num_iterations[target], seconds[target] = number, spent
+        if len(num_iterations) == len(targets) or spent > spec.measurement.time_limit or not np.isfinite(remaining):
             break
-    return CandidateSolve(spec.solver.name, prepared, needs, seconds)
+    return CandidateSolve(spec.solver.name, prepared, num_iterations, seconds)
 
 
-def measure_iterate_seconds(prepared: PreparedSolver, problem: StepProblem, stamps: Sequence[int]) -> list[float]:
-    """Seconds of the thread's processor time to each of these iterates, ascending."""
-    wanted, found = set(stamps), dict[int, float]()
-    gc.disable()  # a collection in the middle would be counted as the solver's
+def measure_iterate_seconds(prepared: PreparedSolver, problem: StepProblem, numbers: Sequence[int]) -> list[float]:
+    """Measure the thread's processor time [s] up to each of the iterates with these ascending numbers."""
+    timed, found = set(numbers), dict[int, float]()
+    gc.disable()  # otherwise the time of a garbage collection would be attributed to the solver
     try:
         began = thread_time()
-        for number, _ in enumerate(islice(prepared.iterates(problem), stamps[-1]), 1):
-            if number in wanted:
+        for number, _ in enumerate(islice(prepared.iterates(problem), numbers[-1]), 1):
+            if number in timed:
                 found[number] = thread_time() - began
     finally:
         gc.enable()
-    return [found[number] for number in stamps]
+    return [found[number] for number in numbers]
 
 
 def measure_interleaved(
-    racers: Sequence[CandidateSolve], problem: StepProblem, rounds: int
+    candidates: Sequence[CandidateSolve], problem: StepProblem, rounds: int
 ) -> dict[str, dict[float, NDArray[np.float64]]]:
-    """Seconds (rounds,) to each accuracy, of each method, interleaved, in one order and then in the other."""
-    times: dict[str, dict[float, list[float]]] = {one.name: {target: [] for target in one.needs} for one in racers}
-    for turn in range(-1, rounds):  # the first one warms up
-        for one in racers if turn % 2 else racers[::-1]:
-            stamps = sorted(set(one.needs.values()))
-            by_stamp = dict(zip(stamps, measure_iterate_seconds(one.prepared, problem, stamps), strict=True))
-            for target, number in one.needs.items() if turn >= 0 else ():
-                times[one.name][target].append(by_stamp[number])
-    return {name: {target: np.array(values) for target, values in of.items()} for name, of in times.items()}
+    """Measure the times (rounds,) [s] to each accuracy by each method; the order of methods alternates by round."""
+    times = {one.name: {target: list[float]() for target in one.num_iterations} for one in candidates}
+    for round_number in range(-1, rounds):  # the first round is a warm-up
+        for one in candidates if round_number % 2 else candidates[::-1]:
+            numbers = sorted(set(one.num_iterations.values()))
+            by_number = dict(zip(numbers, measure_iterate_seconds(one.prepared, problem, numbers), strict=True))
+            for target, number in one.num_iterations.items() if round_number >= 0 else ():
+                times[one.name][target].append(by_number[number])
+    return {
+        name: {target: np.array(values) for target, values in by_target.items()} for name, by_target in times.items()
+    }
 
 
-def ratio(
+def compute_ratio(
     step: str, target: float, name: str, times: dict[str, dict[float, NDArray[np.float64]]], draws: NDArray[np.int64]
-) -> Ratio | None:
-    """Of one method, None where it and all others miss the accuracy; infinite where it does alone."""
-    others = {other: of[target] for other, of in times.items() if other != name and target in of}
+) -> TimeRatio | None:
+    """Compute the ratio of one method, and its bootstrap interval.
+
+    Return an infinite ratio if only the other methods reach the accuracy, and None if none of the others does.
+
+    step: title of the step; times: of each method by accuracy (rounds,) [s]; draws: indices of resampled rounds
+    (resamples, rounds).
+    """
+    others = {other: by_target[target] for other, by_target in times.items() if other != name and target in by_target}
     if not others:
         return None
     fastest = min(others, key=lambda other: np.median(others[other]))
     least = float(np.median(others[fastest]))
     if target not in times[name]:
-        return Ratio(step, target, fastest, least, np.inf, np.inf, np.inf)
-    mine = times[name][target]
-    best = np.min([np.median(of[draws], axis=-1) for of in others.values()], axis=0)
-    low, high = np.quantile(np.median(mine[draws], axis=-1) / best, ((1 - SHARE) / 2, (1 + SHARE) / 2))
-    return Ratio(step, target, fastest, least, float(np.median(mine)) / least, float(low), float(high))
+        return TimeRatio(step, target, fastest, least, np.inf, np.inf, np.inf)
+    seconds = times[name][target]
+    best = np.min([np.median(other[draws], axis=-1) for other in others.values()], axis=0)
+    resampled = np.median(seconds[draws], axis=-1) / best
+    low, high = np.quantile(resampled, ((1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2))
+    return TimeRatio(step, target, fastest, least, float(np.median(seconds)) / least, float(low), float(high))
 
 
-def ratios(
+def measure_step(
     step: SnapshotEvaluation, specs: Sequence[CurveSpec], name: str, rounds: int, measure: str
-) -> Iterator[Ratio]:
-    """Of one step, from each first guess."""
+) -> Iterator[TimeRatio]:
+    """Yield the ratios of a method on one step, from each initial guess and to each accuracy."""
     rng, targets = np.random.default_rng(0), TARGETS[measure]
-    draws = rng.integers(rounds, size=(DRAWS, rounds))
+    draws = rng.integers(rounds, size=(NUM_RESAMPLES, rounds))
     for guess in specs[0].initial_guesses:
         problem = step.step_snapshot.build_problem(guess)
-        graded = grading(step, problem, measure)
-        racers = [found for spec in specs if (found := build_candidate(spec, problem, graded, targets))]
-        least = {t: min((one.seconds[t] for one in racers if t in one.seconds), default=np.inf) for t in targets}
-        near = [
+        compute_measure = build_measure(step, problem, measure)
+        candidates = [found for spec in specs if (found := build_candidate(spec, problem, compute_measure, targets))]
+        least = {t: min((one.seconds[t] for one in candidates if t in one.seconds), default=np.inf) for t in targets}
+        timed = [
             one
-            for one in racers
-            if one.needs and (one.name == name or any(s <= HOPELESS * least[t] for t, s in one.seconds.items()))
+            for one in candidates
+            if one.num_iterations
+            and (one.name == name or any(s <= MAX_FIRST_PASS_RATIO * least[t] for t, s in one.seconds.items()))
         ]
-        times = {name: {}} | measure_interleaved(near, problem, rounds)
-        words = f"{step.case.title} {step.snapshot_name} {guess}"
-        found = (ratio(words, target, name, times, draws) for target in targets)
+        times = {name: {}} | measure_interleaved(timed, problem, rounds)
+        title = f"{step.case.title} {step.snapshot_name} {guess}"
+        found = (compute_ratio(title, target, name, times, draws) for target in targets)
         yield from (one for one in found if one is not None)
 
 
-def cell(one: Ratio) -> str:
-    """Its words."""
-    over = one.counts and one.high > LIMITS[0]
-    return f"{'>' if over else ''}{one.ratio:.2f} [{one.low:.2f}, {one.high:.2f}] {one.fastest} {1e3 * one.seconds:.2f}"
+def format_ratio(one: TimeRatio) -> str:
+    """Format a table cell: ratio, interval, fastest other method and its milliseconds."""
+    is_above_limit = one.is_counted and one.high > LIMITS[0]
+    mark = ">" if is_above_limit else ""
+    return f"{mark}{one.ratio:.2f} [{one.low:.2f}, {one.high:.2f}] {one.fastest} {1e3 * one.seconds:.2f}"
 
 
-def lines(found: Iterable[Ratio], targets: Sequence[float]) -> Iterator[str]:
-    """One for each first guess of a step."""
+def format_lines(found: Iterable[TimeRatio], targets: Sequence[float]) -> Iterator[str]:
+    """Yield a line for each initial guess of a step, with a column for each accuracy."""
     rows: dict[str, dict[float, str]] = {}
     for one in found:
-        rows.setdefault(one.step, {})[one.target] = cell(one)
+        rows.setdefault(one.step, {})[one.target] = format_ratio(one)
     for step, cells in rows.items():
-        yield row(step, [cells.get(target, "") for target in targets])
+        yield align_columns(step, [cells.get(target, "") for target in targets])
 
 
-def row(first: str, cells: Sequence[str]) -> str:
-    """In columns."""
+def align_columns(first: str, cells: Sequence[str]) -> str:
+    """Return a line with columns of fixed width."""
     return f"{first:<40}" + "".join(f"{cell:<38}" for cell in cells).rstrip()
 
 
 def main() -> None:
-    """Print ratio, interval, the fastest other method and its milliseconds, step by step."""
+    """Print the ratio, its interval, the fastest other method and its milliseconds for each step."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("config", nargs="?", type=Path, default=ROOT / "configs" / "accuracy.yaml")
-    parser.add_argument("--solver", default="hybrid", help="whose ratios")
-    parser.add_argument("--only", default="", help="words that the step's name must have")
+    parser.add_argument("--solver", default="hybrid", help="solver whose ratios are measured")
+    parser.add_argument("--only", default="", help="words that the step's title contains")
     parser.add_argument("--rounds", type=int, default=15)
-    parser.add_argument("--measure", choices=list(TARGETS), default="gap", help="what an accuracy is of")
+    parser.add_argument("--measure", choices=list(TARGETS), default="gap", help="quantity that an accuracy bounds")
     parser.add_argument("--publish", type=Path, help="folder of a published study")
     given = parser.parse_args()
-    begin, found, targets = describe_provenance(), list[Ratio](), TARGETS[given.measure]
-    print(row(f"step, first guess; {given.measure}", [f"{target:g}" for target in targets]))
+    begin, found, targets = describe_provenance(), list[TimeRatio](), TARGETS[given.measure]
+    print(align_columns(f"step, first guess; {given.measure}", [f"{target:g}" for target in targets]))
     with limit_threads(1):
-        for step, specs in steps(given.config, given.only):
-            of_step = list(ratios(step, specs, given.solver, given.rounds, given.measure))
-            print(*lines(of_step, targets), sep="\n", flush=True)
+        for step, specs in load_steps(given.config, given.only):
+            of_step = list(measure_step(step, specs, given.solver, given.rounds, given.measure))
+            print(*format_lines(of_step, targets), sep="\n", flush=True)
             found += of_step
-    counted = [one for one in found if one.counts]
+    counted = [one for one in found if one.is_counted]
     for limit in LIMITS:
         within = sum(one.ratio <= limit for one in counted)
-        print(f"{within} of {len(counted)} accuracies that take above {1e3 * COUNTS:g} ms are within {limit:g}")
+        print(
+            f"{within} of {len(counted)} accuracies that take above {1e3 * MIN_COUNTED_SECONDS:g} ms are within {limit:g}"
+        )
     print(f"{sum(one.ratio == np.inf for one in found)} of {len(found)} accuracies are not reached")
-    rows = [{"solver": given.solver, "measure": given.measure, **asdict(one), "counts": one.counts} for one in found]
+    rows = [
+        {"solver": given.solver, "measure": given.measure, **asdict(one), "counts": one.is_counted} for one in found
+    ]
     publish_rows(given.publish, given.config, f"python -m tests.bench.fastest {given.config}", rows, begin)
 
 
