@@ -1,14 +1,15 @@
-"""Contact by pairs compared with ipctk, interleaved on one thread: cloth folded into four layers that all touch.
+"""Measure the operations of barrier contact compared with ipctk, on a cloth folded into four layers that all touch.
 
     python -m tests.bench.pairs [--sizes 64 128] [--rounds 5] [--publish results/published/pairs]
 
-Gaps are 4 mm at 64 vertices a side and go with the spacing; they are felt up to 5/4 of that. Printed is how many times
-as long ipctk takes, by CPU times: in the middle, and the least and the most of the rounds. Both have the same pairs in
-range, and count closest points that several of them have in common once. ipctk comes with the extra `dev`.
+The gap between layers is 4 mm at 64 vertices a side and proportional to the spacing of vertices. The minimum distance
+is a quarter of the gap, and the barrier acts up to 5/4 of the gap. Both programs run interleaved on one thread. The
+table has the CPU time of ipctk relative to this project's: the median, the least and the largest ratio of the rounds.
+Both have the same active pairs, and merge pairs of the same closest points. ipctk belongs to the extra `dev`.
 
-    value + gradient        with the pairs searched again; and with those that a solver's iteration still has
-    Hessian                 clamped, with the pairs given: blocks, and of ipctk the matrix
-    candidates + safe step  of a step that closes gaps: LBVH and additive CCD
+    value + gradient        with a new search for pairs; and with cached pairs, as in a solver's iterations
+    Hessian                 projected to positive semidefinite, with cached pairs: blocks here, a matrix by ipctk
+    candidates + safe step  collision-free step size of a step that closes gaps, with LBVH and additive CCD
 """
 
 from __future__ import annotations
@@ -37,11 +38,11 @@ from tests.bench.scripted_study import describe_provenance, publish_rows
 
 CONFIG = Path(__file__).parents[2] / "configs" / "contact.yaml"
 GAP, LAYERS = 0.004, 4
-"""At 64 vertices a side [m]."""
+"""Distance of layers at 64 vertices a side [m], and number of layers."""
 
 
 class FoldedSheet(NamedTuple):
-    """mesh: at rest; p (n, 3) [m]: folded; d (n, 3) [m]: a step; min_distance, dhat [m]."""
+    """A folded sheet: mesh at rest, folded positions p (n, 3) [m], displacement d (n, 3) [m], and contact distances."""
 
     mesh: Mesh
     p: Positions
@@ -51,7 +52,7 @@ class FoldedSheet(NamedTuple):
 
 
 def fold_sheet(size: int) -> FoldedSheet:
-    """Columns go to and fro, one layer above the other, vertex over vertex but for a little noise."""
+    """Fold a sheet into layers that lie vertex above vertex, with random perturbations of the positions."""
     mesh, rng = GridMesh(diagonals="one").build_mesh(size), np.random.default_rng(0)
     gap, h, columns = GAP * 63 / (size - 1), 1 / (size - 1), -(-size // LAYERS)
     layer, along = np.divmod(np.arange(size), columns)
@@ -63,87 +64,89 @@ def fold_sheet(size: int) -> FoldedSheet:
 
 
 def build_own_work(made: FoldedSheet) -> tuple[dict[str, Callable[[], object]], SelfContact]:
-    """What is timed, by name."""
-    mesh, p, d, thickness, reach = made
+    """Return the timed operations of this project by name, and its contact potential."""
+    mesh, p, d, min_distance, dhat = made
     k = np.ones(len(p))
     contact = SelfContact(
         CollisionMesh.from_rest_shape(
-            mesh.rest_positions, find_collision_primitives(mesh)[0], mesh.triangles, k, thickness, reach
+            mesh.rest_positions, find_collision_primitives(mesh)[0], mesh.triangles, k, min_distance, dhat
         )
     )
 
-    places = cycle([p, p + 1e-12, p - 1e-12])  # what was found at the last two is known, and no more
+    positions = cycle(
+        [p, p + 1e-12, p - 1e-12]
+    )  # results at the last two positions are cached, so three miss the cache
 
-    def slopes() -> float:
-        q = next(places)
+    def evaluate_cached() -> float:
+        q = next(positions)
         contact.add_gradient(q, np.zeros_like(q))
         return contact.value(q)
 
     def evaluate_hessian() -> object:
-        return contact.hessian_blocks(next(places), 0.0)
+        return contact.hessian_blocks(next(positions), 0.0)
 
     def evaluate_uncached() -> float:
         contact.candidate_caches.clear()
-        return slopes()
+        return evaluate_cached()
 
-    def step() -> float:
+    def compute_step_size() -> float:
         contact.candidate_caches.clear()
         return contact.collision_free_step_size(p, d)
 
     return {
         "value + gradient": evaluate_uncached,
-        "the same, pairs known": slopes,
+        "the same, pairs known": evaluate_cached,
         "Hessian": evaluate_hessian,
-        "candidates + safe step": step,
+        "candidates + safe step": compute_step_size,
     }, contact
 
 
 def build_ipctk_work(made: FoldedSheet) -> tuple[dict[str, Callable[[], object]], int]:
-    """The same by ipctk, and how many pairs it has in range."""
+    """Return the timed operations of ipctk by name, and its number of active pairs."""
     import ipctk
 
     ipctk.set_num_threads(1)
-    of: Any = ipctk
-    mesh, p, d, thickness, reach = made
+    ipc: Any = ipctk
+    mesh, p, d, min_distance, dhat = made
     V, W = np.asfortranarray(p), np.asfortranarray(p + d)
-    surface = of.CollisionMesh(
+    surface = ipc.CollisionMesh(
         np.asfortranarray(mesh.rest_positions), find_collision_primitives(mesh)[0].astype(np.int32), mesh.triangles
     )
-    potential = of.BarrierPotential(reach, 1.0)
-    known = of.NormalCollisions()
-    known.build(surface, V, reach, thickness, of.LBVH())
+    potential = ipc.BarrierPotential(dhat, 1.0)
+    cached = ipc.NormalCollisions()
+    cached.build(surface, V, dhat, min_distance, ipc.LBVH())
 
-    def slopes(found: Any) -> float:
-        potential.gradient(found, surface, V)
-        return potential(found, surface, V)
+    def evaluate(collisions: Any) -> float:
+        potential.gradient(collisions, surface, V)
+        return potential(collisions, surface, V)
 
     def evaluate_uncached() -> float:
-        found = of.NormalCollisions()
-        found.build(surface, V, reach, thickness, of.LBVH())
-        return slopes(found)
+        collisions = ipc.NormalCollisions()
+        collisions.build(surface, V, dhat, min_distance, ipc.LBVH())
+        return evaluate(collisions)
 
-    def step() -> float:
-        near = of.Candidates()
-        near.build(surface, V, W, 0.5 * thickness, of.LBVH())
-        return near.compute_collision_free_stepsize(surface, V, W, thickness, of.AdditiveCCD())
+    def compute_step_size() -> float:
+        candidates = ipc.Candidates()
+        candidates.build(surface, V, W, 0.5 * min_distance, ipc.LBVH())
+        return candidates.compute_collision_free_stepsize(surface, V, W, min_distance, ipc.AdditiveCCD())
 
     return {
         "value + gradient": evaluate_uncached,
-        "the same, pairs known": lambda: slopes(known),
-        "Hessian": lambda: potential.hessian(known, surface, V, of.PSDProjectionMethod.CLAMP),
-        "candidates + safe step": step,
-    }, len(known)
+        "the same, pairs known": lambda: evaluate(cached),
+        "Hessian": lambda: potential.hessian(cached, surface, V, ipc.PSDProjectionMethod.CLAMP),
+        "candidates + safe step": compute_step_size,
+    }, len(cached)
 
 
-def seconds(work: Callable[[], object]) -> float:
-    """CPU time of this process."""
+def measure_seconds(work: Callable[[], object]) -> float:
+    """Measure the CPU time [s] of a call."""
     begun = time.process_time()
     work()
     return time.process_time() - begun
 
 
 def main() -> None:
-    """Measure the times and print them."""
+    """Print a table for each size."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--sizes", type=int, nargs="+", default=[64, 128])
     parser.add_argument("--rounds", type=int, default=5)
@@ -156,9 +159,9 @@ def main() -> None:
             (one, contact), (other, pairs) = build_own_work(made), build_ipctk_work(made)
             table = Table("", "ipctk takes", "between", "ours [ms]", box=SIMPLE_HEAD)
             for name, work in one.items():
-                for one_of in (work, other[name]):  # compiled, and in the caches
-                    one_of()
-                both = [(seconds(work), seconds(other[name])) for _ in range(options.rounds)]
+                for warm_up in (work, other[name]):  # compiles, and fills the caches
+                    warm_up()
+                both = [(measure_seconds(work), measure_seconds(other[name])) for _ in range(options.rounds)]
                 ratios = sorted(b / a for a, b in both)
                 rows += [{"size": size, "operation": name, "time_ratio": ratio} for ratio in ratios]
                 ends = f"{ratios[0]:.2f} and {ratios[-1]:.2f}"
