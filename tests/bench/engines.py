@@ -1,12 +1,14 @@
-"""Outside engines compared with ours, by what no trajectory shows: remaining residuals, drift and stability.
+"""Compare third-party engines with this project's solvers by residuals, drift of energy, and stability.
 
     python -m tests.bench.engines [SCENE ...] [--size 9] [--frames 30] [--substeps 4 16 64 256]
 
-Scenes without drag: all energy that goes, or comes, is the method's. A cell is `residual / drift`. The residual is
-|Q^-1 grad g|_Q of implicit Euler's step problem at the answer, over its value at the step's start, the median over the
-frames: 0 for a method that minimises it. The drift is that of kinetic, elastic and gravitational energy, over the
-largest kinetic one. A dash: positions are not finite, or farther away than ten times the mesh's size.
-An engine that cannot express the scene, or is not installed, has `refused`; a run's row says why.
+The scenes have no drag, so that the method causes all changes of the total energy. A cell of the table is
+`residual / drift`, for a number of substeps. The residual is |Q^-1 grad g|_Q of the step problem of implicit Euler at
+the method's positions, over its value at the step's start, the median over the frames. It is 0 for a method that
+minimises the objective. The drift is the change of kinetic, elastic and gravitational energy over the largest kinetic
+energy. A dash denotes positions that are not finite, or displaced by more than ten times the mesh's diagonal.
+`refused` denotes an engine that does not support the scene or is not installed; the row of `springbench run` states the
+reason.
 """
 
 from __future__ import annotations
@@ -42,55 +44,56 @@ ENGINES: tuple[tuple[str, dict[str, Any]], ...] = (
     ("xpbd-small-steps", {}),
 )
 OWN_SOLVERS = (("velocity-verlet", "substepping", StopRule(1)), ("hybrid", "implicit-euler", StopRule(200, 1e-6)))
-FAR = 10.0
+MAX_DISPLACEMENT = 10.0
+"""Displacement above which a simulation is unstable, in diagonals of the mesh."""
 
 
-def energy(scene: Scene, p: Positions, v: Positions) -> tuple[float, float]:
-    """All of it, and the kinetic part [J]."""
+def compute_energy(scene: Scene, p: Positions, v: Positions) -> tuple[float, float]:
+    """Compute the total and the kinetic energy [J]."""
     kinetic = 0.5 * float(scene.system.mass @ np.einsum("ij,ij->i", v, v))
     return kinetic + scene.all_springs.value(p) - float(np.einsum("ij,ij->", scene.constant_force, p)), kinetic
 
 
-def cell(scene: Scene, solver: Any, stop: StopRule, frames: int) -> str:
-    """Residual and drift."""
-    oracle, size, begun = (
+def measure_cell(scene: Scene, solver: Any, stop: StopRule, frames: int) -> str:
+    """Simulate a scene by a solver, and format the cell of its residual and drift."""
+    evaluator, size, initial = (
         ReferenceEvaluator(scene.system),
         scene.mesh.bounding_box_diagonal or 1.0,
         build_initial_state(scene).motion,
     )
-    first, most = energy(scene, *begun)
-    last, left = first, list[float]()
+    first, max_kinetic = compute_energy(scene, *initial)
+    last, residuals = first, list[float]()
     try:
         for step in simulate_scene(scene, prepare(scene, solver), stop, initial_guess="previous", frames=frames):
             p, v = step.state.motion
-            if not np.isfinite(p).all() or np.abs(p - scene.mesh.rest_positions).max() > FAR * size:
+            if not np.isfinite(p).all() or np.abs(p - scene.mesh.rest_positions).max() > MAX_DISPLACEMENT * size:
                 return "–"
-            left.append(oracle.measure_stationarity(step.problem, p).stationarity)
-            last, kinetic = energy(scene, p, v)
-            most = max(most, kinetic)
+            residuals.append(evaluator.measure_stationarity(step.problem, p).stationarity)
+            last, kinetic = compute_energy(scene, p, v)
+            max_kinetic = max(max_kinetic, kinetic)
     except Unsupported:
         return "refused"
-    return f"{np.median(left):.1e} / {100 * (last - first) / most:+.2g} %"
+    return f"{np.median(residuals):.1e} / {100 * (last - first) / max_kinetic:+.2g} %"
 
 
-def rows(path: Path, size: int, frames: int, substeps: list[int]) -> Iterator[tuple[str, ...]]:
-    """Of one scene."""
+def measure_scene(path: Path, size: int, frames: int, substeps: list[int]) -> Iterator[tuple[str, ...]]:
+    """Yield a table row for each engine and solver on a scene."""
     scene = build_exact_scene(load_scene(path), size, "substepping")
     for name, parameters in ENGINES:
         made = load_target(SOLVER_TABLE[name])(**parameters)
-        words = " ".join(map(str, (name, *parameters.values())))
-        yield words, *(cell(scene, made, StopRule(number), frames) for number in substeps)
+        title = " ".join(map(str, (name, *parameters.values())))
+        yield title, *(measure_cell(scene, made, StopRule(number), frames) for number in substeps)
     for name, integrator, stop in OWN_SOLVERS:
         yield (
             f"{name}, {integrator}",
-            cell(
+            measure_cell(
                 build_exact_scene(load_scene(path), size, integrator), load_target(SOLVER_TABLE[name])(), stop, frames
             ),
         )
 
 
 def main() -> None:
-    """Print a table a scene."""
+    """Print a table for each scene."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("scenes", nargs="*", type=Path, default=SCENES, metavar="SCENE")
     parser.add_argument("--size", type=int, default=9)
@@ -103,7 +106,7 @@ def main() -> None:
             least = estimate_max_frequency(system) * system.time_step / 2.0
             title = f"{path.stem} {options.size}: omega h is 2 at {least:.3g} substeps"
             table = Table("substeps", *map(str, options.substeps), box=SIMPLE_HEAD, title=title)
-            for row in rows(path, options.size, options.frames, options.substeps):
+            for row in measure_scene(path, options.size, options.frames, options.substeps):
                 table.add_row(*row)
             Console(width=140).print(table)
 

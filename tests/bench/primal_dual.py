@@ -1,13 +1,13 @@
-"""Primal compared with dual descent, by ratios of stiffness and of mass (Macklin, Erleben and Mueller 2020).
+"""Compare primal with dual descent by ratios of stiffness and of mass (Macklin, Erleben and Mueller 2020).
 
     python -m tests.bench.primal_dual [--publish results/published/primal-dual]
 
-A chain of 17 vertices that hangs straight, its first step: a ratio multiplies the stiffness of every second spring of
-1,000 N/m, or the last mass of a chain of 100,000 N/m. Primal methods change positions vertex by vertex: `vbd`, by Gauss
-and Seidel, with and without its acceleration, and Jacobi's (`jgs2`, `neighbour_rings: 0`). Dual ones change the
-tensions of springs: `xpbd`, by Gauss and Seidel. A cell is how many iterations it takes until every vertex is within a
-thousandth of the step's displacement of where it ends; a dash: not within 100,000. The line stays straight, so what
-XPBD tends to is the minimum.
+The problem is the first step of a chain of 17 vertices that hangs straight down. A ratio multiplies the stiffness of
+every second spring in a chain of 1,000 N/m, or the mass of the last vertex in a chain of 100,000 N/m. Primal methods
+update positions vertex by vertex: `vbd` by Gauss-Seidel sweeps, with and without acceleration, and `jgs2` without
+neighbour rings by Jacobi sweeps. Dual methods update the tensions of springs: `xpbd` by Gauss-Seidel sweeps. A cell is
+the number of iterations until the largest error of a coordinate is at most a thousandth of the step's largest
+displacement; a dash denotes more than 100,000. The chain stays straight, so that XPBD converges to the minimum.
 """
 
 from __future__ import annotations
@@ -45,34 +45,38 @@ METHODS: dict[str, Solver] = {
     "primal, accelerated: vbd": VertexBlockDescent(),
     "dual, Gauss-Seidel: xpbd": Xpbd(),
 }
-LEVEL, MOST = 1e-3, 100_000
-"""Distance from the end over the step's displacement, and iterations at most."""
+LEVEL, MAX_ITERATIONS = 1e-3, 100_000
+"""Largest error over the step's displacement, and iteration limit."""
 
 
-def hanging(stiffness: float, stiffer: float = 1.0, heavier: float = 1.0) -> StepProblem:
-    """The chain's first step. stiffness: of springs [N/m]; stiffer: every second one; heavier: the last vertex."""
+def build_hanging_chain(stiffness: float, stiffness_ratio: float = 1.0, mass_ratio: float = 1.0) -> StepProblem:
+    """Build the first step of the hanging chain.
+
+    stiffness: of the springs [N/m]; stiffness_ratio: factor of every second spring; mass_ratio: factor of the last
+    mass.
+    """
     pins = PinsEffect.model_validate({"parts": ["first"], "weight": "exact"})
     down = ChainMesh(direction=(0.0, -1.0, 0.0))
-    stated = build_first_problem(
+    problem = build_first_problem(
         build_test_scene(
             down, SpringsEffect(scaling_rule="fixed", stretch=stiffness), GravityEffect(), pins, size=17, mass=1.0
         )
     )
-    mass = stated.system.mass.copy()
-    mass[-1] *= heavier
-    (found,) = stated.system.energies
+    mass = problem.system.mass.copy()
+    mass[-1] *= mass_ratio
+    (found,) = problem.system.energies
     assert isinstance(found, spring_energy.Springs)
-    k = np.where(np.arange(len(found.edges)) % 2, stiffer, 1.0) * found.stiffness
+    k = np.where(np.arange(len(found.edges)) % 2, stiffness_ratio, 1.0) * found.stiffness
     energies = (replace(found, stiffness=k),)
-    force = stated.external_force * (mass / stated.system.mass)[:, None]
-    return replace(stated, system=replace(stated.system, mass=mass, energies=energies), external_force=force)
+    force = problem.external_force * (mass / problem.system.mass)[:, None]
+    return replace(problem, system=replace(problem.system, mass=mass, energies=energies), external_force=force)
 
 
-def iterations(solver: Solver, stated: StepProblem) -> int | None:
-    """Iterations until all vertices are within the requested distance of the minimum."""
-    end = NewtonSolver().prepare(stated.system).solve(stated, StopRule(200, 1e-12)).positions
-    displacement = float(np.abs(end - stated.current_positions).max())
-    for k, p in enumerate(islice(solver.prepare(stated.system).iterates(stated), MOST), 1):
+def count_iterations(solver: Solver, problem: StepProblem) -> int | None:
+    """Count the iterations until the error is at most LEVEL; return None if the iteration limit is not sufficient."""
+    end = NewtonSolver().prepare(problem.system).solve(problem, StopRule(200, 1e-12)).positions
+    displacement = float(np.abs(end - problem.current_positions).max())
+    for k, p in enumerate(islice(solver.prepare(problem.system).iterates(problem), MAX_ITERATIONS), 1):
         if np.abs(p - end).max() <= LEVEL * displacement:
             return k
     return None
@@ -84,15 +88,15 @@ def main() -> None:
     parser.add_argument("--publish", type=Path, help="folder of a published study")
     options = parser.parse_args()
     begin, rows = describe_provenance(), list[dict[str, Any]]()
-    problems = {
-        "stiffer springs": [hanging(1e3, stiffer=ratio) for ratio in RATIOS],
-        "a heavier end": [hanging(1e5, heavier=ratio) for ratio in RATIOS],
+    problems_by_title = {
+        "stiffer springs": [build_hanging_chain(1e3, stiffness_ratio=ratio) for ratio in RATIOS],
+        "a heavier end": [build_hanging_chain(1e5, mass_ratio=ratio) for ratio in RATIOS],
     }
     with limit_threads(1):
-        for title, stated in problems.items():
+        for title, problems in problems_by_title.items():
             table = Table(f"{title}, by", *(f"{ratio:,.0f}" for ratio in RATIOS), box=SIMPLE_HEAD)
             for name, solver in METHODS.items():
-                counts = [iterations(solver, one) for one in stated]
+                counts = [count_iterations(solver, problem) for problem in problems]
                 table.add_row(name, *("–" if count is None else f"{count:,}" for count in counts))
                 rows += [
                     {"ratio_of": title, "ratio": ratio, "method": name, "num_iterations": count}
