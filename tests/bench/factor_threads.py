@@ -1,13 +1,13 @@
-"""What a second thread saves in an iteration of Newton's method, and how that compares with MKL PARDISO.
+"""Measure the speedup of an iteration of Newton's method by a second thread, compared with MKL PARDISO.
 
     python -m tests.bench.factor_threads [--sizes 32 64 128 256 400] [--rounds 9]
         [--publish results/published/factor-threads]
 
-An iteration is the gradient, the Hessian, its factorisation, the solve, and the change of the objective, on a sheet
-that is stretched by 5 %, so that the Hessian is positive definite. PARDISO, with the optional dependency `pardiso`,
-only factorises that Hessian, analysed before. Rounds of one and two threads alternate; a pause between both programs
-lets the waiting threads of either fall asleep. The table has median wall times, and medians of the rounds' ratios with
-their quartiles. It needs two idle cores.
+An iteration consists of the gradient, the Hessian, its factorisation, the solve, and the change of the objective, on a
+sheet that is stretched by 5 %, so that the Hessian is positive definite. PARDISO, an optional dependency (`pardiso`),
+computes the numeric factorisation of that Hessian alone. Measurements with one and two threads alternate. A pause
+separates the two programs, so that waiting threads of one do not spin during the measurement of the other. The table
+has median wall times, and medians of the rounds' ratios with their quartiles. It requires two idle cores.
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ from tests.bench.scripted_study import describe_provenance, publish_rows
 SCENE = Path(__file__).parents[2] / "configs" / "scenes" / "hanging-cloth.yaml"
 
 PAUSE = 0.3
-"""Seconds between both programs: Intel's waiting threads spin for 0.2."""
+"""Pause between the two programs [s]: waiting threads of Intel's runtime spin for 0.2 s."""
 
 
-def newton_iteration(size: int) -> tuple[Callable[[], object], StepObjective, np.ndarray]:
-    """An iteration on the sheet, its objective, and the positions [m] at which it begins."""
+def build_newton_iteration(size: int) -> tuple[Callable[[], object], StepObjective, np.ndarray]:
+    """Return an iteration on the sheet, its objective, and the positions (n, 3) [m] at which it begins."""
     scene = sheet(size)
     step = StepObjective(FixedObjective(scene.system), build_problem(scene, build_initial_state(scene), "previous"))
     p = step.apply_exact_pins(1.05 * scene.mesh.rest_positions)
@@ -53,10 +53,10 @@ def newton_iteration(size: int) -> tuple[Callable[[], object], StepObjective, np
     return iterate, step, p
 
 
-def pardiso_factorisation(step: StepObjective, p: np.ndarray, threads: int) -> Callable[[], object] | None:
-    """PARDISO's factorisation of the Hessian by a number of threads; None without pypardiso.
+def build_pardiso_factorisation(step: StepObjective, p: np.ndarray, threads: int) -> Callable[[], object] | None:
+    """Return PARDISO's numeric factorisation of the Hessian with a number of threads; None without pypardiso.
 
-    An analysis is for one number of threads.
+    The symbolic factorisation is computed here, since it is valid for one number of threads.
     """
     try:
         from pypardiso import PyPardisoSolver  # pyright: ignore[reportMissingImports]  (an optional dependency)
@@ -64,67 +64,73 @@ def pardiso_factorisation(step: StepObjective, p: np.ndarray, threads: int) -> C
         return None
     matrix = step.hessian(p).assemble_clamped()
     graph, n = matrix.graph, 3 * matrix.graph.shape[0]
-    whole = bsr_array((matrix.values, graph.indices, graph.indptr), shape=(n, n))
-    upper = csr_matrix(triu(whole.tocsr(), format="csr"))
+    full = bsr_array((matrix.values, graph.indices, graph.indptr), shape=(n, n))
+    upper = csr_matrix(triu(full.tocsr(), format="csr"))
     solver: Any = PyPardisoSolver(mtype=2)  # symmetric positive definite
-    nothing = np.zeros((n, 1))
+    zero_rhs = np.zeros((n, 1))
 
     def run(phase: int) -> object:
         solver.libmkl.MKL_Set_Num_Threads(threads)
         solver.set_phase(phase)
-        return solver._call_pardiso(upper, nothing)
+        return solver._call_pardiso(upper, zero_rhs)
 
-    run(11)
-    return lambda: run(22)
+    run(11)  # symbolic factorisation
+    return lambda: run(22)  # numeric factorisation
 
 
-def _seconds(work: Callable[[], object], repeats: int) -> float:
+def _measure_seconds(work: Callable[[], object], repeats: int) -> float:
     begin = perf_counter()
     for _ in range(repeats):
         work()
     return (perf_counter() - begin) / repeats
 
 
-def _measure(works: list[Callable[[], object]], rounds: int) -> np.ndarray:
-    """Seconds of each work, (rounds, works), in alternating order."""
+def _measure_interleaved(works: list[Callable[[], object]], rounds: int) -> np.ndarray:
+    """Measure wall times (rounds, works) [s]; the order of the works alternates by round."""
     seconds = np.empty((rounds, len(works)))
     for work in works:
         work()
-    repeats = max(1, int(0.02 / _seconds(works[0], 1)))
+    repeats = max(1, int(0.02 / _measure_seconds(works[0], 1)))
     for k in range(rounds):
         for i in range(len(works))[:: 1 if k % 2 == 0 else -1]:
-            seconds[k, i] = _seconds(works[i], repeats)
+            seconds[k, i] = _measure_seconds(works[i], repeats)
     return seconds
 
 
-def _quartiles(name: str, ratios: np.ndarray) -> dict[str, float]:
+def _compute_quartiles(name: str, ratios: np.ndarray) -> dict[str, float]:
+    """Return the columns of the median and the quartiles of ratios."""
     low, middle, high = np.quantile(ratios, (0.25, 0.5, 0.75)).tolist()
     return {name: middle, f"{name}_low": low, f"{name}_high": high}
 
 
-def measure(size: int, rounds: int) -> dict[str, float]:
-    """Measure a size: median milliseconds, and ratios of rounds with their quartiles; without PARDISO only ours."""
-    iterate, step, p = newton_iteration(size)
+def measure_size(size: int, rounds: int) -> dict[str, float]:
+    """Measure a mesh size: a row of median milliseconds, and of ratios with their quartiles.
 
-    def by_threads(threads: int) -> Callable[[], object]:
+    The columns of PARDISO are absent if it is not installed.
+    """
+    iterate, step, p = build_newton_iteration(size)
+
+    def limit_iteration(threads: int) -> Callable[[], object]:
         return lambda: (numba.set_num_threads(threads), iterate())
 
-    ours = _measure([by_threads(1), by_threads(2)], rounds)
-    one, two = np.median(ours, axis=0).tolist()
+    seconds = _measure_interleaved([limit_iteration(1), limit_iteration(2)], rounds)
+    one, two = np.median(seconds, axis=0).tolist()
     row = {"size": size, "one_thread_ms": 1e3 * one, "two_threads_ms": 1e3 * two}
-    row |= _quartiles("thread_ratio", ours[:, 0] / ours[:, 1])
+    row |= _compute_quartiles("thread_ratio", seconds[:, 0] / seconds[:, 1])
     sleep(PAUSE)
-    theirs = [work for k in (1, 2) if (work := pardiso_factorisation(step, p, k))]
-    if theirs:
-        seconds = _measure(theirs, rounds)
+    factorisations = [work for k in (1, 2) if (work := build_pardiso_factorisation(step, p, k))]
+    if factorisations:
+        pardiso_seconds = _measure_interleaved(factorisations, rounds)
         sleep(PAUSE)
-        pardiso_one, pardiso_two = np.median(seconds, axis=0).tolist()
+        pardiso_one, pardiso_two = np.median(pardiso_seconds, axis=0).tolist()
         row |= {"pardiso_one_thread_ms": 1e3 * pardiso_one, "pardiso_two_threads_ms": 1e3 * pardiso_two}
-        row |= _quartiles("pardiso_ratio", seconds[:, 1] / two)
+        row |= _compute_quartiles("pardiso_ratio", pardiso_seconds[:, 1] / two)
     return row
 
 
-def _list_cells(row: dict[str, float]) -> list[str]:
+def _format_cells(row: dict[str, float]) -> list[str]:
+    """Format the table cells of a row; a dash denotes an absent column."""
+
     def format_ratio(name: str) -> str:
         return f"{row[name]:.2f} ({row[f'{name}_low']:.2f} to {row[f'{name}_high']:.2f})" if name in row else "-"
 
@@ -153,8 +159,8 @@ def main() -> None:
     table = Table(*columns, box=SIMPLE_HEAD)
     with limit_threads(2):
         for size in given.sizes:
-            rows.append(measure(size, given.rounds))
-            table.add_row(*_list_cells(rows[-1]))
+            rows.append(measure_size(size, given.rounds))
+            table.add_row(*_format_cells(rows[-1]))
     Console(width=120).print(table)
     publish_rows(given.publish, SCENE, "python -m tests.bench.factor_threads", rows, begin)
 

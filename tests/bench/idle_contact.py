@@ -1,16 +1,17 @@
-"""What contact costs while nothing is near: steps of cloth with contact over steps without.
+"""Measure the overhead of idle contact: steps of cloth with contact but without active pairs, over steps without.
 
     python -m tests.bench.idle_contact [--tables steps broad-phases] [--sizes 33 64 128] [--solvers hybrid newton]
         [--scenes cloth flag] [--publish results/published/idle-contact]
 
 steps           The swinging cloth and the flag are simulated to a relative residual of 1e-6: with self-contact, with
-                surface contact to a plane 5 m below, and without. Both simulations advance one step each in turn on one
-                thread, in several rounds. The ratio is that of the processor times of all steps after the first two, up
-                to the first in which contact acts. Of each step the least time of the rounds counts.
-broad-phases    Three ways to certify that a step with self-contact is free of collisions and ends without active pairs:
-                affine clusters, the hierarchy of boxes, and a list of the pairs within a skin, which is made again
-                where two vertices may have moved relative to each other by more than the skin. The best of several
-                skins counts.
+                surface contact to a plane 5 m below, and without contact. The simulations with and without contact
+                alternate step by step on one thread, in several rounds. The ratio is that of the processor times of
+                all steps after the first two, up to the first in which contact acts. The time of a step is the least
+                of the rounds.
+broad-phases    Three methods certify that a step with self-contact is free of collisions and ends without active pairs:
+                affine clusters, the bounding volume hierarchy, and a neighbour list with a skin. The list is built
+                again when the bound of relative displacements of vertices exceeds the skin. The result of the list is
+                that of the fastest of several skins.
 """
 
 from __future__ import annotations
@@ -55,7 +56,7 @@ CONTACTS: dict[str, SceneEffect] = {
 }
 STOP, NUM_WARMUP_STEPS = StopRule(5000, 1e-6), 2
 SKIN_FACTORS, MAX_LIST_PAIRS = (2.0, 5.0, 10.0, 20.0, 40.0), 2_000_000
-"""Skins of lists, in activation distances."""
+"""Skins of neighbour lists, as multiples of the minimum plus the activation distance; and their largest size."""
 
 
 def measure_step_ratio(
@@ -96,7 +97,7 @@ def measure_step_ratio(
 
 
 class BroadPhases(NamedTuple):
-    """Processor time [ms] of a step's certificate by method; skin [m]: that of the list, nan where none suffices."""
+    """Processor time [ms] of a step's certificate by method; skin [m] of the list, nan if none is sufficient."""
 
     clusters: float
     boxes: float
@@ -105,7 +106,7 @@ class BroadPhases(NamedTuple):
 
 
 def measure_broad_phases(cloth: str, size: int, frames: int) -> BroadPhases:
-    """Measure certificates of the steps of a motion without contact."""
+    """Measure the certificates for the steps of a motion without contact."""
     spec = load_scene(SCENES / CLOTHS[cloth])
     scene = build_scene(spec, size, log_warnings=False)
     contact = spec.model_copy(update={"effects": (*spec.effects, CONTACTS["self-contact"])})
@@ -117,56 +118,59 @@ def measure_broad_phases(cloth: str, size: int, frames: int) -> BroadPhases:
     steps = simulate_scene(
         scene, prepare(scene, HybridNewton()), StopRule(60, 1e-2), initial_guess="previous", frames=frames
     )
-    path = [scene.mesh.rest_positions, *(step.positions.copy() for step in steps)]
-    pairs, limit = list(pairwise(path))[NUM_WARMUP_STEPS:], mesh.min_distance + mesh.dhat
+    trajectory = [scene.mesh.rest_positions, *(step.positions.copy() for step in steps)]
+    step_ends, limit = list(pairwise(trajectory))[NUM_WARMUP_STEPS:], mesh.min_distance + mesh.dhat
     query = CollisionQuery(1.5 * limit, mesh.min_distance, MIN_GAP_FRACTION)
 
-    def by_clusters(p: Positions, q: Positions) -> object:
+    def certify_by_clusters(p: Positions, q: Positions) -> object:
         return mesh.compute_clearance_bounds(p, q, query)
 
-    def by_boxes(p: Positions, q: Positions) -> object:
+    def certify_by_boxes(p: Positions, q: Positions) -> object:
         d = q - p - (q - p).mean(axis=0)
-        x, y, fast = pad_positions(p), pad_positions(p + d), float(np.linalg.norm(d, axis=1).max())
-        limits = CollisionQuery(limit, mesh.min_distance, MIN_GAP_FRACTION, 2.0 * fast)
-        return [certify(mesh.find_ccd_candidates(x, y, limits, edges), p, q) for edges in (False, True)]
+        x, y, max_length = pad_positions(p), pad_positions(p + d), float(np.linalg.norm(d, axis=1).max())
+        box_query = CollisionQuery(limit, mesh.min_distance, MIN_GAP_FRACTION, 2.0 * max_length)
+        return [certify(mesh.find_ccd_candidates(x, y, box_query, edges), p, q) for edges in (False, True)]
 
-    def certify(near: Candidates, p: Positions, q: Positions) -> tuple[float, float]:
-        d = q - p - (q - p).mean(axis=0)
-        free = ccd.collision_free_step_size(near, pad_positions(p), pad_positions(d), 1.0, *ccd.allocate_ccd_scratch())
-        return free, float(compute_distances(near, q).min(initial=np.inf))
+    def certify(candidates: Candidates, p: Positions, q: Positions) -> tuple[float, float]:
+        """Return the collision-free step size and the least distance at q [m]."""
+        d, scratch = q - p - (q - p).mean(axis=0), ccd.allocate_ccd_scratch()
+        step_size = ccd.collision_free_step_size(candidates, pad_positions(p), pad_positions(d), 1.0, *scratch)
+        return step_size, float(compute_distances(candidates, q).min(initial=np.inf))
 
-    def by_list(skin: float) -> float:
-        """Return the time of a step [s], infinite where the skin is too small or has too many pairs."""
-        at, near, began = path[0], None, thread_time()
-        for p, q in pairs[:6]:
-            if near is None or max(_largest_relative_displacement(at, x) for x in (p, q)) > skin:
-                at, near = p, mesh.find_proximity_candidates(p, limit + skin)
-                if _largest_relative_displacement(at, q) > skin or len(near.vertices) > MAX_LIST_PAIRS:
+    def measure_list(skin: float) -> float:
+        """Return the processor time of a step [s], infinite if the skin is too small or contains too many pairs."""
+        built_at, candidates, began = trajectory[0], None, thread_time()
+        for p, q in step_ends[:6]:
+            if candidates is None or max(_bound_relative_displacement(built_at, x) for x in (p, q)) > skin:
+                built_at, candidates = p, mesh.find_proximity_candidates(p, limit + skin)
+                if _bound_relative_displacement(built_at, q) > skin or len(candidates.vertices) > MAX_LIST_PAIRS:
                     return np.inf
-            certify(near, p, q)
-        return (thread_time() - began) / len(pairs[:6])
+            certify(candidates, p, q)
+        return (thread_time() - began) / len(step_ends[:6])
 
-    for work in (by_clusters, by_boxes):  # compiled
-        work(*pairs[0])
-    took = [[_seconds(work, p, q) for p, q in pairs] for work in (by_clusters, by_boxes)]
-    best, skin = min((by_list(limit * factor), limit * factor) for factor in SKIN_FACTORS)
-    clusters, boxes = np.median(took, axis=1).tolist()
+    methods = certify_by_clusters, certify_by_boxes
+    for certify_step in methods:  # compiles
+        certify_step(*step_ends[0])
+    times = [[_measure_seconds(certify_step, p, q) for p, q in step_ends] for certify_step in methods]
+    best, skin = min((measure_list(limit * factor), limit * factor) for factor in SKIN_FACTORS)
+    clusters, boxes = np.median(times, axis=1).tolist()
     return BroadPhases(1e3 * clusters, 1e3 * boxes, 1e3 * best, skin if np.isfinite(best) else np.nan)
 
 
-def _seconds(work: Callable[[Positions, Positions], object], p: Positions, q: Positions) -> float:
+def _measure_seconds(work: Callable[[Positions, Positions], object], p: Positions, q: Positions) -> float:
     began = thread_time()
     work(p, q)
     return thread_time() - began
 
 
-def _largest_relative_displacement(p: Positions, q: Positions) -> float:
+def _bound_relative_displacement(p: Positions, q: Positions) -> float:
+    """Return an upper bound [m] of the displacement of two vertices relative to each other, from p to q."""
     d = q - p
     return 2.0 * float(np.linalg.norm(d - d.mean(axis=0), axis=1).max())
 
 
 def measure_steps(options: argparse.Namespace) -> list[dict[str, Any]]:
-    """Measure the table `steps` and print it; a row for each ratio."""
+    """Measure the table `steps`, print it, and return a row for each ratio."""
     table = Table("scene", "a side", "solver", "step without, ms", *options.contacts, box=SIMPLE_HEAD)
     table.title = f"a step with contact that is idle over one without; {describe_machine().cpu}"
     rows = list[dict[str, Any]]()
@@ -185,7 +189,7 @@ def measure_steps(options: argparse.Namespace) -> list[dict[str, Any]]:
 
 
 def measure_certificates(options: argparse.Namespace) -> list[dict[str, Any]]:
-    """Measure the table `broad-phases` and print it; a row for each scene, size and method."""
+    """Measure the table `broad-phases`, print it, and return a row for each scene, size and method."""
     table = Table("scene", "a side", "clusters", "boxes", "list", "skin", box=SIMPLE_HEAD)
     table.title = f"certificate of a step with self-contact, in ms; {describe_machine().cpu}"
     rows = list[dict[str, Any]]()

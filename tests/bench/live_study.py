@@ -1,4 +1,10 @@
-"""Live study: real performance tests of a checkout against itself, to validate the replay study."""
+"""Run real performance regression tests of a checkout against itself, to validate the replay study.
+
+    python -m tests.bench.regress_study live RESULTS CONFIG
+
+Both programs have the same code, so that each test without an injected slowdown should pass. The results are the
+verdicts with their confidence sequences, and the conditions of each test.
+"""
 
 from __future__ import annotations
 
@@ -51,7 +57,7 @@ def run_live_study(
     injected_slowdown: float,
     print_message: Callable[[str], None],
 ) -> None:
-    """Run performance tests of each request, and store each result at once.
+    """Run regression tests of each request, and store each result as soon as it is known.
 
     Earlier results in the file remain.
 
@@ -68,7 +74,7 @@ def run_live_study(
     found = parquet_rows.read_rows([path], LIVE_STUDY_SCHEMA).to_pylist() if path.exists() else []
     sides = GitRevision("the one", checkout, injected_slowdown=injected_slowdown), GitRevision("the other", checkout)
     rule = SequentialTest(options.max_ratio, options.alpha)
-    print_once = cache(print_message)  # differences are found at each start
+    print_once = cache(print_message)  # each start reports the same differences
     with run_background_load(background_load):
         for number in range(num_repeats):
             for request in requests:
@@ -94,17 +100,17 @@ def run_live_study(
 
 
 def summarise_live_study(path: Path) -> list[tuple[str, ...]]:
-    """Summarise the stored results by kind of test.
+    """Summarise the stored results of tests under the same conditions.
 
-    A row has the conditions of the test, and the number of each verdict.
+    A row has the conditions of the tests, the number of each verdict, and the median duration.
     """
-    by: dict[tuple[str, str, float, float], list[dict[str, Any]]] = {}
+    grouped: dict[tuple[str, str, float, float], list[dict[str, Any]]] = {}
     for row in parquet_rows.read_rows([path], LIVE_STUDY_SCHEMA).to_pylist():
-        by.setdefault(
+        grouped.setdefault(
             (row["benchmark"], row["background_load"], row["injected_slowdown"], row["max_ratio"]), []
         ).append(row)
     table: list[tuple[str, ...]] = []
-    for (gate, condition, slowdown, max_ratio), rows in by.items():
+    for (gate, condition, slowdown, max_ratio), rows in grouped.items():
         load, seconds = (median(row[name] for row in rows) for name in ("load_average", "seconds"))
         verdicts = [row["verdict"] for row in rows]
         counts = [

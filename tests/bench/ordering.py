@@ -1,13 +1,15 @@
-"""What nested dissection costs and saves, compared with minimum degree and with the preparation of CHOLMOD.
+"""Measure fill and time of nested dissection, compared with minimum degree and with the preparation of CHOLMOD.
 
     python -m tests.bench.ordering [--sizes 64 128 256] [--solids 12 20] [--rounds 5]
         [--publish results/published/ordering]
 
-Sheets have the system matrix of springs along sides and diagonals, solids springs between all neighbours. Minimum
-degree is SuperLU's (of A' + A), whose order is analysed like ours. A factorisation is Newton's, with a solve, in blocks
-of 3 x 3; a solve is that of local-global. Preparation is ordering, symbolic analysis, and the factor for local-global;
-that of CHOLMOD, through cholespy, orders by AMD. Times are the least of the rounds, in ms: processor time with one
-thread, wall time with two.
+A sheet has the system matrix of springs along sides and diagonals; a solid has springs between all neighbours. The
+first table compares two orders with the same symbolic and numeric factorisation: nested dissection, and the minimum
+degree order of SuperLU for the pattern of A' + A. Its columns `factor` measure the factorisation of a Hessian in blocks
+of 3 x 3 with one solve, as in Newton's method; its columns `solve` measure the prefactored solve of local-global. The
+second table has the preparation of local-global: ordering, symbolic factorisation and numeric factorisation, and the
+whole preparation by CHOLMOD, which cholespy calls with the AMD order. Times are the least of the rounds, in ms:
+processor time with one thread, wall time with two.
 """
 
 from __future__ import annotations
@@ -41,24 +43,24 @@ from tests.network_matrices import grid_matrix
 SCENE = Path(__file__).parents[2] / "configs" / "scenes" / "hanging-cloth.yaml"
 
 
-def minimum_degree_order(Q: csr_array) -> NDArray[np.int32]:
-    """SuperLU's minimum degree order of a matrix."""
+def compute_minimum_degree_order(Q: csr_array) -> NDArray[np.int32]:
+    """Compute the minimum degree order (n,) of a matrix by SuperLU."""
     options = {"SymmetricMode": True}
     factor = splu(csc_array(Q), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
     return np.argsort(factor.perm_c).astype(np.int32)
 
 
-def newton_blocks(Q: csr_array) -> NDArray[np.float64]:
-    """Blocks of a positive definite matrix with the pattern of Q, (b, 3, 3)."""
+def build_newton_blocks(Q: csr_array) -> NDArray[np.float64]:
+    """Build the blocks (b, 3, 3) of a positive definite matrix with the pattern of Q."""
     rows = np.repeat(np.arange(Q.shape[0]), np.diff(Q.indptr))
     blocks = np.full((Q.nnz, 3, 3), -0.1) - np.eye(3)
     blocks[rows == Q.indices] = 5.0 * np.diff(Q.indptr).max() * np.eye(3)
     return blocks
 
 
-def least(work: Callable[[], object], rounds: int, clock: Callable[[], float]) -> float:
-    """The least time of a work [ms]."""
-    work()
+def measure_least_time(work: Callable[[], object], rounds: int, clock: Callable[[], float]) -> float:
+    """Measure the least time of a call over several rounds [ms]."""
+    work()  # compiles, and fills the caches
     seconds = []
     for _ in range(rounds):
         begin = clock()
@@ -68,19 +70,19 @@ def least(work: Callable[[], object], rounds: int, clock: Callable[[], float]) -
 
 
 def measure_by_threads(name: str, work: Callable[[], object], rounds: int) -> dict[str, float]:
-    """Return the times of a work with one and two threads [ms]."""
+    """Measure the times of a call with one and two threads [ms]."""
     out = dict[str, float]()
     for threads, clock in (("one", thread_time), ("two", perf_counter)):
         with limit_threads(1 if threads == "one" else 2):
-            out[f"{name}_{threads}_ms"] = least(work, rounds, clock)
+            out[f"{name}_{threads}_ms"] = measure_least_time(work, rounds, clock)
     return out
 
 
 def measure_order(Q: csr_array, order: NDArray[np.int32], rounds: int) -> dict[str, float]:
-    """Return fill, operations and times of an order."""
+    """Measure an order: its fill, its floating-point operations, and times of factorisation and solve [ms]."""
     symbolic = analyse_with_order(np.asarray(Q.indptr, np.int64), np.asarray(Q.indices, np.int32), order)
     newton = BlockCholesky(Q, symbolic_factor=symbolic)
-    blocks, b = newton_blocks(Q), np.random.default_rng(0).normal(size=(Q.shape[0], 3))
+    blocks, b = build_newton_blocks(Q), np.random.default_rng(0).normal(size=(Q.shape[0], 3))
     solver, out = SupernodalCholesky(Q, symbolic_factor=symbolic), np.empty_like(b)
     return {
         "nonzeros": symbolic.nonzeros,
@@ -91,7 +93,7 @@ def measure_order(Q: csr_array, order: NDArray[np.int32], rounds: int) -> dict[s
 
 
 def measure_preparation(Q: csr_array, rounds: int) -> dict[str, float]:
-    """Return the times of the parts of our preparation, of their sum, and of all of CHOLMOD's [ms]."""
+    """Measure the parts of the preparation, their sum, and the whole preparation by CHOLMOD [ms]."""
     pointers, neighbours = np.asarray(Q.indptr, np.int64), np.asarray(Q.indices, np.int32)
     order = nested_dissection_order(pointers, neighbours)
     symbolic: SymbolicFactor = analyse_with_order(pointers, neighbours, order)
@@ -102,7 +104,7 @@ def measure_preparation(Q: csr_array, rounds: int) -> dict[str, float]:
         "cholmod_ms": lambda: SimplicialCholesky(Q),
     }
     with limit_threads(1):
-        times = {name: least(work, rounds, thread_time) for name, work in works.items()}
+        times = {name: measure_least_time(work, rounds, thread_time) for name, work in works.items()}
     return times | {"prepare_ms": times["ordering_ms"] + times["symbolic_ms"] + times["numeric_ms"]}
 
 
@@ -122,7 +124,7 @@ def main() -> None:
     parts = Table("matrix", "ordering", "symbolic", "factor", "all", "CHOLMOD", box=SIMPLE_HEAD)
     for name, Q in matrices.items():
         dissected = nested_dissection_order(np.asarray(Q.indptr, np.int64), np.asarray(Q.indices, np.int32))
-        for order, found in (("nested dissection", dissected), ("minimum degree", minimum_degree_order(Q))):
+        for order, found in (("nested dissection", dissected), ("minimum degree", compute_minimum_degree_order(Q))):
             row = measure_order(Q, found, given.rounds)
             rows.append({"kind": "order", "matrix": name, "order": order} | row)
             times = (f"{row[f'{work}_{threads}_ms']:.2f}" for work in ("factor", "solve") for threads in ("one", "two"))

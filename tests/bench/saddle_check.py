@@ -1,10 +1,12 @@
-"""What the check for saddles takes of a step's time, and in how many steps a bound makes it unnecessary.
+"""Measure the share of the saddle check in the time of a step, and the steps in which a bound replaces its search.
 
     python -m tests.bench.saddle_check [SCENE:SIZE ...] [--solver lbfgs] [--frames 30] [--rtol 1e-6]
         [--publish results/published/saddle-check]
 
-Each step is solved and its end point checked, one after the other, three times; the least processor time of each
-counts. The share is that of the check in the solve, which contains it.
+After each step of a simulation, a solve of the step and a saddle check of its solution are timed three times each,
+interleaved; the least processor times are compared. The share is the time of the check over that of the solve, which
+contains a check, without the first step. The column `by the bound` counts the steps in which a bound of the
+smallest eigenvalue excludes a saddle, so that no search for negative curvature starts.
 """
 
 from __future__ import annotations
@@ -40,25 +42,26 @@ ROUNDS = 3
 
 
 class SearchStarted(Exception):
-    """The bound did not suffice."""
+    """Signals that the check starts a search, as the bound is not sufficient."""
 
 
 def measure_shares(name: str, solver: str, frames: int, stop: StopRule) -> dict[str, Any]:
-    """Measure a scene: its steps, iterations, and the check's share of the time without the first step."""
+    """Measure a scene `NAME:SIZE`: a row with its steps, iterations, and shares of the check."""
     scene, _, size = name.partition(":")
     spec = load_scene(SCENES / f"{scene}.yaml")
     made = build_scene(spec, int(size or spec.default_size or 0))
     prepared, check = prepare(made, load_target(SOLVERS[solver])()), SaddleCheck(FixedObjective(made.system))
     shares, iterations, seconds, bounded, saddles = [], [], [], 0, 0
 
-    def measure(step: SimulationStep) -> tuple[float, float]:
+    def measure_step(step: SimulationStep) -> tuple[float, float]:
+        """Return the least processor times [s] of the solve and of the check."""
         solve = partial(prepared.solve, step.problem, stop)
         search = partial(check.find_lower_point, step.problem, step.solution.positions, step.num_iterations)
-        took = [(_seconds(solve), _seconds(search)) for _ in range(ROUNDS)]
-        return min(whole for whole, _ in took), min(part for _, part in took)
+        times = [(_measure_seconds(solve), _measure_seconds(search)) for _ in range(ROUNDS)]
+        return min(whole for whole, _ in times), min(part for _, part in times)
 
     for step in simulate_scene(made, prepared, stop, initial_guess="previous", frames=frames):
-        whole, part = measure(step)
+        whole, part = measure_step(step)
         shares.append(part / whole)
         seconds.append(whole)
         iterations.append(step.num_iterations)
@@ -76,7 +79,7 @@ def measure_shares(name: str, solver: str, frames: int, stop: StopRule) -> dict[
     }  # fmt: skip
 
 
-def _seconds(call: Callable[[], object]) -> float:
+def _measure_seconds(call: Callable[[], object]) -> float:
     start = thread_time()
     call()
     return thread_time() - start

@@ -1,10 +1,11 @@
-"""How often our own gates are wrong while other programs keep the machine busy: each is run several times.
+"""Measure how often this project's performance regression tests give a wrong verdict on a busy machine.
 
     python -m tests.bench.under_load [--times 50] [--background-load busy] [--budget 10] [GATE ...]
 
-A background program on each core sweeps over memory, always (`busy`) or in bursts (`bursty`); `nothing` leaves the
-load to other programs. The work of both sides is prepared again for each benchmark. None may fail: the ratios lie
-below their limits by more than the load changes them.
+Each gate is run several times under a background load: a process on each core that sweeps over memory, constantly
+(`busy`) or in bursts (`bursty`). `nothing` adds no load to that of other programs. Candidate and baseline are prepared
+again for each run. A verdict `fail` is wrong, since each gate's ratio is below its limit by more than the effect of
+the load. The table counts the verdicts, and has medians of ratio, duration and load average.
 """
 
 from __future__ import annotations
@@ -31,9 +32,9 @@ MEASURED_GATES = ("harness-against-bare-solver-64", "numba-against-sparse-64", "
 
 
 def run_gate(gate: Gate, budget: float) -> BenchmarkResult:
-    """One benchmark of a gate, as by `paired_benchmark` of the pytest plugin."""
+    """Run the benchmark of a gate once, in the same way as `paired_benchmark` of the pytest plugin."""
     candidate, baseline = gate.candidate(), gate.baseline()
-    assert gate.tolerance is not None, f"{gate.name}: has no answers to compare"
+    assert gate.tolerance is not None, f"{gate.name}: has no results to compare"
     require_agreement(candidate(), baseline(), gate.tolerance)
     programs = build_program_pair(candidate, baseline, gate.clock)
     return run_paired_benchmark(programs, SequentialTest(gate.limit, gate.error), time_budget=budget)
@@ -58,9 +59,9 @@ def main() -> None:
                 console.print(f"{number + 1} of {options.times}, {name}: {results[-1]}", style="dim")
     table = Table("gate", "limit", "fail", "pass", "inconclusive", "ratio", "median s", "load", box=SIMPLE_HEAD)
     for name, results in found.items():
-        answers = Counter(result.verdict for result in results)
+        verdicts = Counter(result.verdict for result in results)
         counts = (
-            str(answers[verdict])
+            str(verdicts[verdict])
             for verdict in (RegressionVerdict.FAIL, RegressionVerdict.PASS, RegressionVerdict.INCONCLUSIVE)
         )
         ratio, seconds, load = (
