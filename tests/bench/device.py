@@ -1,12 +1,13 @@
-"""Does a CUDA device change the choice of a solver? A step by methods on the device and on the processor, side by side.
+"""Measure solvers on a CUDA device compared with solvers on the processor, on single steps of a falling cloth.
 
     python -m tests.bench.device [--scenes SCENE ...] [--sizes 64 128 256] [--on device processor] [--threads 1]
         [--methods NAME ...] [--rounds 3] [--save FILE.parquet] [--publish results/published/devices]
 
-The step is one of a cloth as it falls. Methods that are on both are first compared by their iterates: the
-distance in units of what is required of it, 1e-10 m in float64 and 1e-5 of the springs' mean length in float32. Then
-each method solves the step to the same residuals: the median of warm wall times, from the step problem on the host to
-its solution there. XPBD, which minimises nothing, does ten iterations. Nothing else may run meanwhile.
+Methods that exist for both are first compared by their iterates. Their distance is stated in units of the accepted
+one: 1e-10 m in float64, and 1e-5 of the mean spring length in float32. Then each method solves the step to the same
+residuals. Its time is the median of wall times without compilation, from the step problem in host memory to the
+solution in host memory. XPBD, which does not minimise the objective, runs ten iterations. No other program may run at
+the same time.
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ SCENE = Path(__file__).parents[2] / "configs" / "scenes" / "hanging-cloth.yaml"
 PROCESSOR = ("hybrid", "newton", "lbfgs", "numba", "vbd", "newton-cg")
 XPBD_ITERATIONS = 10
 MAX_SOLVE_SECONDS = 6.0
-"""A method is left out at smaller tolerances than that at which it takes longer."""
+"""Time of a solve [s] above which a method is not measured at smaller tolerances."""
 
 BOTH: dict[str, tuple[Callable[..., Any], int]] = {
     "vbd": (VertexBlockDescent, 20),
@@ -55,11 +56,11 @@ BOTH: dict[str, tuple[Callable[..., Any], int]] = {
     "xpbd-small-steps": (XpbdSmallSteps, XPBD_ITERATIONS),
     "newton-cg": (lambda **on: NewtonCG(preconditioner="schwarz", **on), 2),
 }
-"""Methods on both, and how many iterates of each are compared."""
+"""Methods that exist for device and processor, and the number of the iterate that is compared."""
 
 
 def build_step(scene: Path, size: int, frames: int) -> StepProblem:
-    """The step of a scene after a number of steps to a residual of 1e-3."""
+    """Build the problem of the step of a scene after a number of steps to a residual of 1e-3."""
     made = build_scene(load_scene(scene), size)
     state = build_initial_state(made)
     if frames:
@@ -69,8 +70,8 @@ def build_step(scene: Path, size: int, frames: int) -> StepProblem:
     return build_problem(made, state, "previous")
 
 
-def iterate(prepared: PreparedSolver, problem: StepProblem, count: int) -> Positions:
-    """The last of a number of iterates, copied."""
+def compute_iterate(prepared: PreparedSolver, problem: StepProblem, count: int) -> Positions:
+    """Compute the iterate (n, 3) [m] with a number."""
     *_, found = (p.copy() for p in islice(prepared.iterates(problem), count))
     return found
 
@@ -78,8 +79,8 @@ def iterate(prepared: PreparedSolver, problem: StepProblem, count: int) -> Posit
 def compare_iterates(problem: StepProblem, methods: list[str]) -> Iterator[dict[str, Any]]:
     """Yield a row for each method and precision: the distance of its last iterate from the processor's.
 
-    In the same units, `change_units` is how far the processor's moves where its start is changed by round-off of that
-    precision; `fall_ratio` is the fall of the objective over the processor's.
+    `change_units` is the change of the processor's iterate, in the same units, when its start is changed by round-off
+    of that precision. `fall_ratio` is the decrease of the objective over that by the processor's iterate.
     """
     length = spacing(problem)
     step, rng = StepObjective(FixedObjective(problem.system), problem), np.random.default_rng(0)
@@ -89,30 +90,35 @@ def compare_iterates(problem: StepProblem, methods: list[str]) -> Iterator[dict[
     for name in methods:
         method, count = BOTH[name]
 
-        wanted = iterate(method().prepare(problem.system), problem, count)
+        reference = compute_iterate(method().prepare(problem.system), problem, count)
         for precision, unit, round_off in (("float64", 1e-10, 4e-16), ("float32", 1e-5 * length, 1e-7)):
             began = perf_counter()
             prepared = method(device="cuda", precision=precision).prepare(problem.system)
-            found = iterate(prepared, problem, count)
+            found = compute_iterate(prepared, problem, count)
             seconds = perf_counter() - began
             assert isinstance(prepared, PreparedDeviceSolver)
             again = [prepared.replay_iterations(problem, count)[0].positions for _ in range(3)]
             target, guess = ((x + round_off * length * noise) for x in (problem.inertial_target, problem.initial_guess))
             start = replace(problem, inertial_target=target, initial_guess=guess)
-            changed = iterate(method().prepare(problem.system), start, count)
-            falls = [step.objective_change(p, problem.initial_guess)[0] for p in (found, wanted)]
+            changed = compute_iterate(method().prepare(problem.system), start, count)
+            falls = [step.objective_change(p, problem.initial_guess)[0] for p in (found, reference)]
             yield {
                 "kind": "iterates", "method": name, "precision": precision, "iterations": count,
-                "distance": float(np.abs(found - wanted).max()), "units": float(np.abs(found - wanted).max() / unit),
-                "change_units": float(np.abs(changed - wanted).max() / unit), "fall_ratio": float(falls[0] / falls[1]),
+                "distance": float(np.abs(found - reference).max()),
+                "units": float(np.abs(found - reference).max() / unit),
+                "change_units": float(np.abs(changed - reference).max() / unit),
+                "fall_ratio": float(falls[0] / falls[1]),
                 "is_repeatable": all(bool((p == found).all()) for p in again), "first_seconds": seconds,
             }  # fmt: skip
 
 
-def measure(
+def measure_method(
     solver: Solver, name: str, problem: StepProblem, tolerances: list[float], max_iterations: int, rounds: int
 ) -> list[dict[str, Any]]:
-    """Rows of one method: a time to each tolerance, up to the first that is not reached, each the median of rounds."""
+    """Return a row of one method for each tolerance up to the first that it does not reach: the median time of rounds.
+
+    A method that minimises no objective has one row.
+    """
     prepared = solver.prepare(problem.system)
     rows = list[dict[str, Any]]()
     for rtol in tolerances if type(solver).is_minimiser else (None,):
@@ -181,14 +187,14 @@ def main() -> None:
                     for precision in given.precisions:
                         if perf_counter() - begun < given.seconds:
                             solver = BOTH[name][0](device="cuda", precision=precision)
-                            add(shared, measure(solver, f"{name}, {precision}", problem, *stopping))
+                            add(shared, measure_method(solver, f"{name}, {precision}", problem, *stopping))
             if "processor" in given.on:
                 for name in methods:
                     if perf_counter() - begun < given.seconds:
                         solver = load_target(SOLVERS[name])()
-                        add(shared | {"device": None}, measure(solver, name, problem, *stopping))
+                        add(shared | {"device": None}, measure_method(solver, name, problem, *stopping))
     for scene in given.scenes:
-        Console(width=120).print(tabulate([row for row in rows if row["scene"] == scene.stem], scene.stem))
+        Console(width=120).print(build_table([row for row in rows if row["scene"] == scene.stem], scene.stem))
     publish_rows(given.publish, given.scenes[0], "python -m tests.bench.device", compare_sides(rows), begin)
 
 
@@ -217,8 +223,8 @@ def compare_sides(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     ]
 
 
-def tabulate(rows: list[dict[str, Any]], scene: str) -> Table:
-    """Milliseconds of each method by size and tolerance, on one scene."""
+def build_table(rows: list[dict[str, Any]], scene: str) -> Table:
+    """Build the table of a scene: milliseconds of each method by mesh size and tolerance."""
     timed = [row for row in rows if row["kind"] == "time"]
     cells = sorted({(row["size"], row["rtol"] or 0.0) for row in timed}, key=lambda cell: (cell[0], -cell[1]))
     table = Table("method", "on", *(f"{size}, {rtol:g}" for size, rtol in cells), box=SIMPLE_HEAD, title=f"{scene}, ms")
@@ -230,7 +236,7 @@ def tabulate(rows: list[dict[str, Any]], scene: str) -> Table:
 
 
 def is_reached(row: dict[str, Any]) -> bool:
-    """Whether a solve ended at its tolerance, if it has one."""
+    """Return whether a solve reached its tolerance, or has none."""
     return row["rtol"] is None or row["reason"] == "converged"
 
 

@@ -1,14 +1,18 @@
-"""XPBD compared with MGPBD, where papers measure them: in the dual.
+"""Measure the convergence of XPBD and MGPBD by the dual residual of spring tensions.
 
     python -m tests.bench.duals [--setup] [--publish results/published/duals] [PROBLEM ...]
 
-What the tensions of springs are off by, |K^1/2 C - K^-1/2 t|, over what it is where a step begins (MGPBD draws
-|C - t/k|, which is the same where all springs are alike): how many iterations it takes to a hundredth, a thousandth, a
-millionth, and where XPBD is after 500. Then how far the end is from the step's minimum, over how far the step goes, at
-the worst vertex; and the processor time to a hundredth, MGPBD's over XPBD's. --setup: iterations of conjugate gradients
-to 1e-6 in the step's first linear system, by what makes the prolongations, and the megabytes that each goes through.
+The dual residual is |K^1/2 C - K^-1/2 t|, where K has the stiffnesses, C the elongations and t the tensions of springs.
+It is relative to that at the start of the step. The MGPBD paper plots |C - t/k|, which is the same if all stiffnesses
+are equal. The table has the number of iterations to residuals of 1e-2, 1e-3 and 1e-6, and the residual of XPBD after
+500 iterations. The error is the largest distance of a coordinate from the step's minimum, over the step's largest
+displacement. The last column is the processor time of MGPBD to a residual of 1e-2 over that of XPBD.
 
-A chain, cloths in their third step, and a cube of springs that was pressed flat and lets go, as the paper's bunny does.
+With `--setup` the table has two numbers for each way to build the prolongation: the iterations of conjugate gradients
+to a residual of 1e-6 in the first linear system of the step, and the megabytes that each of them reads.
+
+The problems are a chain in its first step, cloths in their third step, and a cube of springs that is released from a
+flat state, like the bunny of the paper.
 """
 
 from __future__ import annotations
@@ -54,10 +58,11 @@ CLOTHS = {
 }
 CUBES = {"cube, 1 MPa, 11": (11, 1e6), "cube, 100 MPa, 11": (11, 1e8), "cube, 100 MPa, 16": (16, 1e8)}
 LEVELS = (1e-2, 1e-3, 1e-6)
-MOST, STALL = {"xpbd": 20_000, "mgpbd": 60}, 500
-ALONE = "smoothing alone"
+MAX_ITERATIONS, STALL = {"xpbd": 20_000, "mgpbd": 60}, 500
+"""Iteration limits, and the iteration at which the residual of XPBD is stated."""
+SMOOTHING_ALONE = "smoothing alone"
 SOLVER_VARIANTS = {
-    ALONE: MultigridXpbd(near_null_vectors=0),
+    SMOOTHING_ALONE: MultigridXpbd(near_null_vectors=0),
     "equal tensions": MultigridXpbd(near_null_vectors=0),
     "near-kernel": MultigridXpbd(),
     "equal, smoothed": MultigridXpbd(near_null_vectors=0, smooth_prolongation=True),
@@ -65,22 +70,25 @@ SOLVER_VARIANTS = {
 }
 
 
-class Course(NamedTuple):
-    """misfits: after each iteration, over that before the first; seconds: of processor time until each; end: positions
-    (n, 3) [m]; linear: iterations of conjugate gradients in each."""
+class ConvergenceHistory(NamedTuple):
+    """History of a solve, by iteration.
 
-    misfits: list[float]
+    residuals: dual residual after each iteration over the initial one; seconds: processor time up to each [s]; end:
+    last positions (n, 3) [m]; linear_iterations: iterations of conjugate gradients in each.
+    """
+
+    residuals: list[float]
     seconds: list[float]
     end: np.ndarray
-    linear: list[int]
+    linear_iterations: list[int]
 
-    def until(self, level: float) -> int | None:
-        """How many iterations it takes to a level; None where it does not come there."""
-        return next((k for k, misfit in enumerate(self.misfits, 1) if misfit <= level), None)
+    def count_iterations(self, level: float) -> int | None:
+        """Count the iterations to a relative residual; return None if it is not reached."""
+        return next((k for k, residual in enumerate(self.residuals, 1) if residual <= level), None)
 
 
-def cloth(path: str, size: int) -> StepProblem:
-    """The third step of a cloth from rest."""
+def build_cloth_problem(path: str, size: int) -> StepProblem:
+    """Build the problem of the third step of a cloth from rest."""
     made = build_scene(load_scene(CONFIGS / path), size)
     *_, last = simulate_scene(
         made, prepare(made, HybridNewton()), StopRule(500, 1e-6), initial_guess="previous", frames=3
@@ -88,8 +96,8 @@ def cloth(path: str, size: int) -> StepProblem:
     return last.problem
 
 
-def cube(size: int, modulus: float) -> StepProblem:
-    """The first step of a cube of a metre and a ton that was pressed flat."""
+def build_cube_problem(size: int, modulus: float) -> StepProblem:
+    """Build the problem of the first step of a cube of 1 m and 1000 kg that is released from a flat state."""
     made = build_test_scene(
         BlockMesh(height=1.0, depth=1.0), SpringsEffect(stretch=modulus), size=size, mass=1000.0, time_step=0.01
     )
@@ -97,8 +105,8 @@ def cube(size: int, modulus: float) -> StepProblem:
     return build_problem(made, MotionState(Motion(flat, np.zeros_like(flat)), None, 0), "previous")
 
 
-def chain() -> StepProblem:
-    """The first step of a chain that is pinned at both ends."""
+def build_chain_problem() -> StepProblem:
+    """Build the problem of the first step of a chain that is pinned at both ends."""
     pins = PinsEffect.model_validate({"parts": ["ends"], "weight": "exact"})
     return build_first_problem(
         build_test_scene(ChainMesh(length=2.0), SpringsEffect(stretch=1e4), GravityEffect(), pins, size=3000)
@@ -106,82 +114,88 @@ def chain() -> StepProblem:
 
 
 PROBLEMS: dict[str, Callable[[], StepProblem]] = {
-    "chain, 10,000 N, 3000": chain,
-    **{name: lambda path=path, size=size: cloth(path, size) for name, (path, size) in CLOTHS.items()},
-    **{name: lambda size=size, modulus=modulus: cube(size, modulus) for name, (size, modulus) in CUBES.items()},
+    "chain, 10,000 N, 3000": build_chain_problem,
+    **{name: lambda path=path, size=size: build_cloth_problem(path, size) for name, (path, size) in CLOTHS.items()},
+    **{
+        name: lambda size=size, modulus=modulus: build_cube_problem(size, modulus)
+        for name, (size, modulus) in CUBES.items()
+    },
 }
 
 
 class SolveProgress(NamedTuple):
-    """misfit [J^(1/2)], positions (n, 3) [m], iterations of conjugate gradients in the last iteration, and what
-    processor time all of them took [s]."""
+    """State of a solve after an iteration.
 
-    misfit: float
+    residual: dual residual [J^(1/2)]; positions (n, 3) [m]; linear_iterations: iterations of conjugate gradients in
+    the last iteration; seconds: processor time of all iterations [s].
+    """
+
+    residual: float
     positions: np.ndarray
-    linear: int = 0
+    linear_iterations: int = 0
     seconds: float = 0.0
 
 
-def xpbd(stated: StepProblem) -> Iterator[SolveProgress]:
-    """XPBD, before its first iteration and after each."""
-    made = Xpbd().prepare(stated.system)
-    assert isinstance(made, PreparedXpbd)
-    run, own = made.init_state(stated, stated.initial_guess), made.coloured_constraints
-    root, (i, j), seconds = np.sqrt(own.stiffness), own.end_vertices.T, 0.0
+def iterate_xpbd(problem: StepProblem) -> Iterator[SolveProgress]:
+    """Yield the state of XPBD before its first iteration and after each."""
+    prepared = Xpbd().prepare(problem.system)
+    assert isinstance(prepared, PreparedXpbd)
+    run, constraints = prepared.init_state(problem, problem.initial_guess), prepared.coloured_constraints
+    root, (i, j), seconds = np.sqrt(constraints.stiffness), constraints.end_vertices.T, 0.0
     while True:
         p = run.positions
-        stretched = root * (np.linalg.norm(p[i] - p[j], axis=1) - own.rest_length)
-        yield SolveProgress(float(np.linalg.norm(stretched - run.spring_tensions / root)), p, 0, seconds)
+        scaled = root * (np.linalg.norm(p[i] - p[j], axis=1) - constraints.rest_length)
+        yield SolveProgress(float(np.linalg.norm(scaled - run.spring_tensions / root)), p, 0, seconds)
         began = time.process_time()
         run.step_state()
         seconds += time.process_time() - began
 
 
-def mgpbd(stated: StepProblem, solver: MultigridXpbd) -> Iterator[SolveProgress]:
-    """MGPBD, likewise; it ends where nothing moves any more."""
-    run, moved, seconds = solver.prepare(stated.system).init_state(stated, stated.initial_guess), True, 0.0
-    while moved:
+def iterate_mgpbd(problem: StepProblem, solver: MultigridXpbd) -> Iterator[SolveProgress]:
+    """Yield the state of MGPBD before its first iteration and after each, until an iteration moves no vertex."""
+    run, is_moving, seconds = solver.prepare(problem.system).init_state(problem, problem.initial_guess), True, 0.0
+    while is_moving:
         yield SolveProgress(float(np.linalg.norm(run.dual_residual)), run.positions, run.num_cg_iterations, seconds)
         began = time.process_time()
-        moved = run.step_state()
+        is_moving = run.step_state()
         seconds += time.process_time() - began
 
 
-def course(run: Iterator[SolveProgress], most: int) -> Course:
-    """Until the last level is reached, or for so many iterations."""
+def record_history(run: Iterator[SolveProgress], max_iterations: int) -> ConvergenceHistory:
+    """Record the history of a solve until it reaches the smallest of LEVELS, or the iteration limit."""
     begin = next(run)
-    found = Course([], [], begin.positions.copy(), [])
+    found = ConvergenceHistory([], [], begin.positions.copy(), [])
     for now in run:
-        found.misfits.append(now.misfit / begin.misfit)
+        found.residuals.append(now.residual / begin.residual)
         found.seconds.append(now.seconds)
-        found.linear.append(now.linear)
+        found.linear_iterations.append(now.linear_iterations)
         found.end[:] = now.positions
-        if now.misfit <= LEVELS[-1] * begin.misfit or len(found.misfits) == most:
+        if now.residual <= LEVELS[-1] * begin.residual or len(found.residuals) == max_iterations:
             break
     return found
 
 
-def measure_courses(name: str) -> list[dict[str, Any]]:
-    """Measure a problem: a row for each method, with its iterations to LEVELS and its distance from the minimum."""
-    stated = PROBLEMS[name]()
-    minimum = NewtonSolver().prepare(stated.system).solve(stated, StopRule(2000, 1e-9)).positions
-    displacement = float(np.abs(minimum - stated.current_positions).max())
+def measure_convergence(name: str) -> list[dict[str, Any]]:
+    """Measure a problem: a row for each method, with its iterations to LEVELS and its error relative to the minimum."""
+    problem = PROBLEMS[name]()
+    minimum = NewtonSolver().prepare(problem.system).solve(problem, StopRule(2000, 1e-9)).positions
+    displacement = float(np.abs(minimum - problem.current_positions).max())
     found = {
-        "xpbd": course(xpbd(stated), MOST["xpbd"]),
-        "mgpbd": course(mgpbd(stated, MultigridXpbd()), MOST["mgpbd"]),
+        "xpbd": record_history(iterate_xpbd(problem), MAX_ITERATIONS["xpbd"]),
+        "mgpbd": record_history(iterate_mgpbd(problem, MultigridXpbd()), MAX_ITERATIONS["mgpbd"]),
     }
-    springs = len(require_only_springs(stated.system, name).edges)
+    springs = len(require_only_springs(problem.system, name).edges)
 
-    def describe(method: str, one: Course) -> dict[str, Any]:
-        counts = [one.until(level) for level in LEVELS]
+    def describe(method: str, one: ConvergenceHistory) -> dict[str, Any]:
+        counts = [one.count_iterations(level) for level in LEVELS]
         return {
             "problem": name,
             "springs": springs,
             "method": method,
             **{f"iterations_to_{level:g}".replace("-", "_"): k for level, k in zip(LEVELS, counts, strict=True)},
-            "stalled_misfit": one.misfits[STALL - 1] if len(one.misfits) >= STALL else None,
+            "stalled_misfit": one.residuals[STALL - 1] if len(one.residuals) >= STALL else None,
             "end_error": float(np.abs(one.end - minimum).max() / displacement),
-            "linear_iterations": float(np.mean(one.linear)),
+            "linear_iterations": float(np.mean(one.linear_iterations)),
             "reaches_first_level": counts[0] is not None,
             "cpu_seconds": one.seconds[(counts[0] or len(one.seconds)) - 1],
         }
@@ -189,35 +203,35 @@ def measure_courses(name: str) -> list[dict[str, Any]]:
     return [describe(method, one) for method, one in found.items()]
 
 
-def format_courses(rows: list[dict[str, Any]]) -> list[str]:
-    """Format the line of a problem."""
-    plain, multigrid = rows
+def format_convergence(rows: list[dict[str, Any]]) -> list[str]:
+    """Format the table row of a problem; < denotes that XPBD does not reach the first level."""
+    xpbd, mgpbd = rows
     counts = [[row[key] for key in row if key.startswith("iterations_to_")] for row in rows]
     texts = [", ".join("-" if k is None else f"{k:,}" for k in some) for some in counts]
-    ratio = f"{'' if plain['reaches_first_level'] else '<'}{multigrid['cpu_seconds'] / plain['cpu_seconds']:.2g}"
+    ratio = f"{'' if xpbd['reaches_first_level'] else '<'}{mgpbd['cpu_seconds'] / xpbd['cpu_seconds']:.2g}"
     return [
-        plain["problem"],
-        f"{plain['springs']:,}",
+        xpbd["problem"],
+        f"{xpbd['springs']:,}",
         texts[0],
-        "-" if plain["stalled_misfit"] is None else f"{plain['stalled_misfit']:.2g}",
-        f"{plain['end_error']:.1e}",
+        "-" if xpbd["stalled_misfit"] is None else f"{xpbd['stalled_misfit']:.2g}",
+        f"{xpbd['end_error']:.1e}",
         texts[1],
-        f"{multigrid['end_error']:.1e}",
-        f"{multigrid['linear_iterations']:.0f}",
-        ratio if multigrid["reaches_first_level"] else "-",
+        f"{mgpbd['end_error']:.1e}",
+        f"{mgpbd['linear_iterations']:.0f}",
+        ratio if mgpbd["reaches_first_level"] else "-",
     ]
 
 
-def setups(name: str) -> list[str]:
-    """The row of a problem: iterations of conjugate gradients, and the megabytes of each."""
-    stated = PROBLEMS[name]()
+def measure_setups(name: str) -> list[str]:
+    """Return the table row of a problem: the iterations of conjugate gradients by setup, and the megabytes of each."""
+    problem = PROBLEMS[name]()
     row = [name]
     for label, solver in SOLVER_VARIANTS.items():
-        made = solver.prepare(stated.system)
-        run = made.init_state(stated, stated.initial_guess)
-        A = made.dual_matrix(made.scaled_constraints(run.positions)[1])
-        prolongation = made.build_prolongation(A)
-        if label == ALONE:
+        prepared = solver.prepare(problem.system)
+        run = prepared.init_state(problem, problem.initial_guess)
+        A = prepared.dual_matrix(prepared.scaled_constraints(run.positions)[1])
+        prolongation = prepared.build_prolongation(A)
+        if label == SMOOTHING_ALONE:
             prolongation.prolongators.clear()
         cycle = VCycle(A, prolongation)
         count = PreconditionedSolve(A, cycle, run.dual_residual, 1e-6).solve(2000)
@@ -242,10 +256,10 @@ def main() -> None:
     with limit_threads(1):
         for name in given.names:
             if given.setup:
-                table.add_row(*setups(name))
+                table.add_row(*measure_setups(name))
             else:
-                found = measure_courses(name)
-                table.add_row(*format_courses(found))
+                found = measure_convergence(name)
+                table.add_row(*format_convergence(found))
                 rows += found
     Console(width=150).print(table)
     if rows:
