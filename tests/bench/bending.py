@@ -1,15 +1,15 @@
-"""Of what the price of bending consists for Newton's method: fill, factorisations and motion.
+"""Measure the parts of the overhead of bending for Newton's method: fill, factorisations and iterations.
 
     python -m tests.bench.bending [--sizes 33 64] [--frames 8] [--publish results/published/bending]
 
-The hanging cloth with bending and without it advances step by step in turn, to a relative residual of 1e-6, on one
-thread. All columns are ratios, with bending over without, or counts of both.
+The hanging cloth is simulated with bending and without, to a relative residual of 1e-6, on one thread. The two
+simulations alternate step by step. A column is a ratio, with bending over without, or the counts of both.
 
     iteration        processor time of an iteration
-    entries, flops   of a factor of the Hessian: the fill
+    entries, flops   entries of the factor of the Hessian, and floating-point operations of the factorisation
     factor           processor time of one factorisation, at the last step
-    factorisations   per iteration: an indefinite Hessian is factorised again with a shift
-    iterations       per step: the motion is another
+    factorisations   factorisations per iteration: an indefinite Hessian is factorised again with a shift
+    iterations       iterations per step, which differ since the motions differ
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ STOP, NUM_REPEATS = StopRule(5000, 1e-6), 7
 
 
 class MeasuredRun:
-    """A simulation of which steps, iterations, factorisations and processor time [s] are counted."""
+    """A simulation that counts its iterations, its factorisations and its processor time [s]."""
 
     def __init__(self, size: int, frames: int, *effects: str) -> None:
         scene, prepared = prepare_scene(load_scene(PRICES), size, NewtonSolver(), *effects)
@@ -47,17 +47,17 @@ class MeasuredRun:
         self._problem: Any = None
 
     def run_step(self, *, is_counted: bool) -> None:
-        """Compute the next step."""
+        """Compute the next step; include it in the counts if `is_counted`."""
         before, began = self.factor.num_factorisations, thread_time()
         step = next(self._steps)
-        took, self._problem = thread_time() - began, step.problem
+        seconds, self._problem = thread_time() - began, step.problem
         if is_counted:
-            self.seconds += took
+            self.seconds += seconds
             self.num_iterations += step.num_iterations
             self.num_factorisations += self.factor.num_factorisations - before
 
     def measure_factorisation(self) -> float:
-        """Return the least processor time of a factorisation [s]."""
+        """Measure the least processor time [s] of a factorisation at the last step."""
         factorise, times = self._prepared.iteration_phases(self._problem)["factor"], list[float]()
         for _ in range(NUM_REPEATS):
             began = thread_time()
@@ -82,13 +82,13 @@ def main() -> None:
             for k in range(NUM_WARMUP_STEPS + options.frames):
                 for run in runs[:: 1 if k % 2 else -1]:
                     run.run_step(is_counted=k >= NUM_WARMUP_STEPS)
-            bent, plain = runs
-            iteration = bent.seconds / bent.num_iterations * plain.num_iterations / plain.seconds
+            bending, plain = runs
+            iteration = bending.seconds / bending.num_iterations * plain.num_iterations / plain.seconds
             ratios = {
                 "iteration_time_ratio": iteration,
-                "entries_ratio": bent.factor.nonzeros / plain.factor.nonzeros,
-                "flops_ratio": bent.factor.flops / plain.factor.flops,
-                "factor_time_ratio": bent.measure_factorisation() / plain.measure_factorisation(),
+                "entries_ratio": bending.factor.nonzeros / plain.factor.nonzeros,
+                "flops_ratio": bending.factor.flops / plain.factor.flops,
+                "factor_time_ratio": bending.measure_factorisation() / plain.measure_factorisation(),
             }
             per_iteration = [run.num_factorisations / run.num_iterations for run in runs]
             rows.append({"size": size, **ratios, "factorisation_ratio": per_iteration[0] / per_iteration[1]})

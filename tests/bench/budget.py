@@ -1,18 +1,19 @@
-"""Is the budget question answered well: the error of `springbench recommend --budget`, over the least in hindsight.
+"""Measure the error of the method that `springbench recommend --budget` selects, over the least error in hindsight.
 
-    ratio = error(recommended) / min_m error(m)      m: fixed choices whose time is within the budget
+    ratio = error(recommended) / min_m error(m)      m: settings whose time is within the budget
 
     python -m tests.bench.budget [--only NAME ...] [--rounds 5] [--search-time 30]
 
-Ten shipped scenes, small and short. A fixed choice is a method, a solver and a step size, of a grid that is finer and
-wider than the search's own (`GRID`, `REFINEMENTS`). One pass measures all of them, from long steps to short ones, until
-a method takes twice the budget. Those that may be the best then take turns with the recommended one, round after round.
+The questions are ten small scenes with a budget each. A setting is a solver with its options, an integrator and a step
+size, from a grid that is finer and wider than that of the search (`build_grid`, `REFINEMENTS`). One pass measures all
+settings, from large step sizes to small ones, until a method takes twice the budget. The settings that may be the best
+are then measured interleaved with the recommended one, for several rounds.
 
-Times scatter. A choice is within the budget if the median of its rounds is; if the recommended one takes longer there,
-as on a machine that has become busy, its own median is the limit of all. A choice within 5 % of that is on neither side
-for sure: the last column is the ratio with these too. Where other programs interrupt a round, processor time counts, as
-in the search. Errors below that of the reference, 0.1 %, count as that. The exit code is 1 if a ratio without the
-doubtful choices is above 1.3.
+A setting is within the budget if the median of its rounds is. If that of the recommended setting is above the budget,
+for example on a busy machine, it replaces the budget. Settings above 95 % of this limit are uncertain: the column
+`ratio` excludes them, and the last column includes them. When other programs interrupt a round, processor time replaces
+wall time, as in the search. Errors below the error of the reference, 0.1 %, are set to that. The exit code is 1 if a
+ratio without uncertain settings exceeds 1.3.
 """
 
 from __future__ import annotations
@@ -51,14 +52,14 @@ from springbench.solvers.registry import SOLVERS, find_solver_info, load_target
 from tests.progress_displays import SilentDisplay
 
 SCENES = Path(__file__).parents[2] / "configs" / "scenes"
-LIMIT, SURE = 1.3, 0.95
-"""Largest ratio; and part of the budget within which a median is for sure."""
-HOPELESS_TIME, HOPELESS_ERROR = 2.0, 1.2
-"""Times the budget at which a method ends, and times the least error at which a choice takes no turns."""
+LIMIT, CERTAIN_FRACTION = 1.3, 0.95
+"""Largest accepted ratio, and fraction of the budget below which a median is certainly within it."""
+MAX_TIME_RATIO, MAX_ERROR_RATIO = 2.0, 1.2
+"""Largest ratio of time to the budget in the first pass, and of the error to the least for an interleaved setting."""
 NUM_INTERLEAVED = 8
-"""Number of choices that take turns."""
+"""Number of settings that are measured interleaved with the recommended one."""
 REFINEMENTS = (1, 2, 3, 4, 6, 8, 12, 16)
-"""Numbers of steps relative to those of the scene's own time step."""
+"""Numbers of steps relative to the time step of the scene."""
 IMPLICIT_INTEGRATORS = ["implicit-euler", "bdf2", "midpoint", "sdirk-2", "sdirk-4", "esdirk-4"]
 
 
@@ -85,8 +86,8 @@ QUESTIONS = (
 )
 
 
-class Choice(NamedTuple):
-    """A fixed choice with its error and its time for a frame [s]."""
+class MeasuredSetting(NamedTuple):
+    """A setting with its error and its time for a frame [s]."""
 
     spec: WorkSpec
     error: float
@@ -99,11 +100,11 @@ class Choice(NamedTuple):
 
 
 def build_grid() -> list[dict[str, Any]]:
-    """The fixed choices: solvers that choose steps themselves, such as iterate, and such as minimise."""
+    """Build the grid of settings: adaptive solvers, solvers with iteration counts, and solvers with tolerances."""
     infos = {name: find_solver_info(load_target(target), name) for name, target in SOLVERS.items()}
-    own = [name for name, info in infos.items() if info.is_substepping and info.supports_error_control]
+    adaptive = [name for name, info in infos.items() if info.is_substepping and info.supports_error_control]
     return [
-        {"solver": own, "max_iterations": 1, "integrator": ["substepping"]},
+        {"solver": adaptive, "max_iterations": 1, "integrator": ["substepping"]},
         {"solver": ["numba", "xpbd", "baraff-witkin", "vbd"], "max_iterations": [1, 2, 5, 10, 20]},
         {
             "solver": ["newton", "lbfgs"],
@@ -114,27 +115,30 @@ def build_grid() -> list[dict[str, Any]]:
     ]
 
 
-def measure(spec: WorkSpec, trajectory: Any, frame: float) -> Choice:
-    """Measure a simulation once; what has no error has an infinite one."""
+def measure_setting(spec: WorkSpec, trajectory: Any, frame: float) -> MeasuredSetting:
+    """Measure a setting once; error and time are infinite if the simulation has no result."""
     row = build_work_rows(spec, trajectory, lambda: None)[0]
     if not is_measured(row):
-        return Choice(spec, inf, inf)
+        return MeasuredSetting(spec, inf, inf)
     error = row["error"] if row["status"] == "ok" else BUDGET_REFERENCE_ERROR
-    return Choice(spec, max(error, BUDGET_REFERENCE_ERROR), frame * compute_setting_cost(spec, row))
+    return MeasuredSetting(spec, max(error, BUDGET_REFERENCE_ERROR), frame * compute_setting_cost(spec, row))
 
 
-def screen(specs: Sequence[WorkSpec], trajectory: Any, question: Question, frame: float) -> list[Choice]:
-    """Measure all choices once, and return those that may be within the budget."""
+def screen_settings(
+    specs: Sequence[WorkSpec], trajectory: Any, question: Question, frame: float
+) -> list[MeasuredSetting]:
+    """Measure all settings once, and return those that may be within the budget."""
 
-    def method(spec: WorkSpec) -> str:
+    def describe_method(spec: WorkSpec) -> str:
         return repr((spec.solver, spec.case.integrator, spec.options))
 
-    found, limit = list[Choice](), HOPELESS_TIME * question.budget
-    most = max(0.1, limit * question.t_end / frame)
-    ordered = sorted(specs, key=lambda spec: (method(spec), -spec.case.scene.time_step))
-    for _, several in groupby(ordered, method):
+    found, limit = list[MeasuredSetting](), MAX_TIME_RATIO * question.budget
+    time_limit = max(0.1, limit * question.t_end / frame)
+    ordered = sorted(specs, key=lambda spec: (describe_method(spec), -spec.case.scene.time_step))
+    for _, several in groupby(ordered, describe_method):
         for spec in several:
-            one = measure(replace(spec, measurement=replace(spec.measurement, time_limit=most)), trajectory, frame)
+            limited = replace(spec, measurement=replace(spec.measurement, time_limit=time_limit))
+            one = measure_setting(limited, trajectory, frame)
             if one.seconds > limit:
                 break
             found.append(one)
@@ -143,26 +147,28 @@ def screen(specs: Sequence[WorkSpec], trajectory: Any, question: Question, frame
     return [one for one in found if one.seconds <= LIMIT * question.budget]
 
 
-def measure_interleaved(choices: Sequence[Choice], trajectory: Any, frame: float, rounds: int) -> list[Choice]:
-    """Repeat the measurements, one after the other in each round, and return the choices with their median times."""
-    times = [[] for _ in choices]
+def measure_interleaved(
+    settings: Sequence[MeasuredSetting], trajectory: Any, frame: float, rounds: int
+) -> list[MeasuredSetting]:
+    """Measure all settings in each round, and return them with their median times."""
+    times = [[] for _ in settings]
     for _ in range(rounds):
-        for one, seconds in zip(choices, times, strict=True):
-            seconds.append(measure(one.spec, trajectory, frame).seconds)
-    return [one._replace(seconds=median(seconds)) for one, seconds in zip(choices, times, strict=True)]
+        for one, seconds in zip(settings, times, strict=True):
+            seconds.append(measure_setting(one.spec, trajectory, frame).seconds)
+    return [one._replace(seconds=median(seconds)) for one, seconds in zip(settings, times, strict=True)]
 
 
 class BudgetResult(NamedTuple):
-    """The recommended choice, and the best in hindsight: surely within the budget, and by the median."""
+    """The recommended setting, and the best ones in hindsight: without and with uncertain settings."""
 
-    recommended: Choice
-    best: Choice
-    best_by_median: Choice
-    num_choices: int
+    recommended: MeasuredSetting
+    best: MeasuredSetting
+    best_by_median: MeasuredSetting
+    num_settings: int
 
 
 def evaluate_question(question: Question, rounds: int, search_time: float, results: Path) -> BudgetResult:
-    """Recommend a method, and measure the fixed choices."""
+    """Recommend a method for a question, and measure the settings of the grid."""
     path, budget, t_end = SCENES / f"{question.scene}.yaml", question.budget, question.t_end
     scene, store = load_scene(path), open_reference_store(results)
     options = RecommendationOptions(question.size or None, t_end, time_limit=5.0, search_time=search_time)
@@ -173,29 +179,34 @@ def evaluate_question(question: Question, rounds: int, search_time: float, resul
     candidates = StudyCandidates([{"name": name} for name in names], grid, REFINEMENTS)
     specs = build_study(path, scene, found.best_method.work_spec.case.size, candidates, t_end, 5.0).work
     trajectory = load_reference_trajectory(specs[0], store)
-    screened = screen(specs, trajectory, question, scene.time_step)
-    answer = measure(found.best_method.work_spec, trajectory, scene.time_step)
-    hindsight = _select_promising([answer, *screened], budget)
-    recommended, *others = measure_interleaved([answer, *hindsight], trajectory, scene.time_step, rounds)
+    screened = screen_settings(specs, trajectory, question, scene.time_step)
+    selected = measure_setting(found.best_method.work_spec, trajectory, scene.time_step)
+    hindsight = _select_promising([selected, *screened], budget)
+    recommended, *others = measure_interleaved([selected, *hindsight], trajectory, scene.time_step, rounds)
     limit = max(budget, recommended.seconds)
-    sure, within = (
-        min((recommended, *(one for one in others if one.seconds <= part * limit)), key=_error) for part in (SURE, 1.0)
+    certain, within = (
+        min((recommended, *(one for one in others if one.seconds <= part * limit)), key=_get_error)
+        for part in (CERTAIN_FRACTION, 1.0)
     )
-    return BudgetResult(recommended, sure, within, len(specs))
+    return BudgetResult(recommended, certain, within, len(specs))
 
 
-def _select_promising(choices: Sequence[Choice], budget: float) -> list[Choice]:
-    """Keep the choices that may be the best, the first one aside: none is left out for a time that scatters."""
-    least = min(one.error for one in choices if one.seconds <= SURE * budget or one is choices[0])
-    return sorted((one for one in choices[1:] if one.error <= HOPELESS_ERROR * least), key=_error)[:NUM_INTERLEAVED]
+def _select_promising(settings: Sequence[MeasuredSetting], budget: float) -> list[MeasuredSetting]:
+    """Return the settings that may be the best, without the first one, which is the recommended one.
+
+    Errors select them, since a single measured time is not accurate enough.
+    """
+    least = min(one.error for one in settings if one.seconds <= CERTAIN_FRACTION * budget or one is settings[0])
+    promising = (one for one in settings[1:] if one.error <= MAX_ERROR_RATIO * least)
+    return sorted(promising, key=_get_error)[:NUM_INTERLEAVED]
 
 
-def _error(choice: Choice) -> float:
-    return choice.error
+def _get_error(setting: MeasuredSetting) -> float:
+    return setting.error
 
 
 def main() -> None:
-    """Print a line for each question."""
+    """Print a line for each question, then a table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", nargs="+", metavar="NAME", help="scenes (default: all ten)")
     parser.add_argument("--rounds", type=int, default=5)
@@ -211,26 +222,26 @@ def main() -> None:
             began = monotonic()
             try:
                 found = evaluate_question(one, options.rounds, options.search_time, Path(folder))
-            except RunFailed as refused:
-                console.print(f"{one.scene}: {refused}")
+            except RunFailed as error:
+                console.print(f"{one.scene}: {error}")
                 is_missed = True
                 continue
-            given, best = found.recommended, found.best
-            ratios = [given.error / other.error for other in (best, found.best_by_median)]
+            recommended, best = found.recommended, found.best
+            ratios = [recommended.error / other.error for other in (best, found.best_by_median)]
             is_missed |= ratios[0] > LIMIT
             cells = [
                 f"{one.scene} {one.size or ''}",
                 f"{1e3 * one.budget:g}",
-                str(given),
-                f"{1e3 * given.seconds:.3g}",
-                f"{given.error:.2e}",
+                str(recommended),
+                f"{1e3 * recommended.seconds:.3g}",
+                f"{recommended.error:.2e}",
                 str(best),
                 f"{1e3 * best.seconds:.3g}",
                 f"{best.error:.2e}",
                 *(f"{ratio:.2f}" for ratio in ratios),
             ]
             table.add_row(*cells)
-            console.print(" | ".join(cells), f"({found.num_choices} choices, {monotonic() - began:.0f} s)")
+            console.print(" | ".join(cells), f"({found.num_settings} settings, {monotonic() - began:.0f} s)")
     console.print(table)
     sys.exit(int(is_missed))
 

@@ -1,17 +1,18 @@
-"""Can barriers alone serve as contact? Half spaces and barriers for the same floor.
+"""Compare half spaces with barriers as contact with the same floor, by time and penetration.
 
     python -m tests.bench.half_spaces [--size 24] [--block 4] [--frames 40] [--rounds 2] [--solvers hybrid newton]
         [--publish results/published/half-spaces]
 
-Scenes have the effect `contact` (vertices against half spaces), then `surface-contact` (barriers), with the same plane
-and minimum distance, and are simulated to a relative residual of 1e-6. Thin barriers act within a tenth of the minimum
-distance, which is how far half spaces may be entered. All advance one step each in turn on one thread, in several
-rounds; of each step the least processor time of the rounds counts.
+Each scene has the effect `contact` (vertices against half spaces), or `surface-contact` (barriers) with the same plane
+and minimum distance. It is simulated to a relative residual of 1e-6. Thin barriers have an activation distance of a
+tenth of the minimum distance, the depth to which half spaces may be entered. The simulations alternate step by step on
+one thread, in several rounds. The time of a step is the least processor time of the rounds.
 
-    nothing near    the hanging cloth 5 m above the floor, as ratios to the cloth without a floor
-    resting         a block that has fallen 5 cm: a step of the last third of the frames, in ms
-    resting height  how far its lowest vertices lie from the minimum distance above the floor at the end, in mm
-    hard touch      two hard cases: steps at the iteration limit, and the deepest vertex below the minimum distance, mm
+    nothing near    time of a step of the hanging cloth 5 m above the floor, relative to the cloth without a floor
+    resting         time of a step of a block that has fallen 5 cm, over the last third of the frames [ms]
+    resting height  height of its lowest layer of vertices above the minimum distance at the end [mm]
+    limited steps   in two hard cases: steps that reach the iteration limit, and the largest depth of a vertex below the
+                    minimum distance [mm]
 """
 
 from __future__ import annotations
@@ -54,7 +55,11 @@ HARD_CASES = ("thrown-1e4", "at-the-thickness")
 
 
 class Motion(NamedTuple):
-    """Motion with one kind of floor: least processor time of each step [s], last positions, limits, and depth [m]."""
+    """Motion with one kind of floor.
+
+    step_seconds: least processor time of each step [s]; positions: last ones (n, 3) [m]; num_limited_steps: steps that
+    reach the iteration limit; lowest_height: of all vertices and steps [m].
+    """
 
     step_seconds: NDArray[np.float64]
     positions: Positions
@@ -74,7 +79,7 @@ def build_floor(kind: str, height: float, min_distance: float = MIN_DISTANCE) ->
 def simulate_interleaved(
     specs: Sequence[SceneSpec], size: int | None, solver: str, frames: int, rounds: int
 ) -> list[Motion]:
-    """Simulate scenes step by step in turn, and return their motions."""
+    """Simulate scenes interleaved step by step, and return their motions."""
     scenes = [build_scene(one, size or one.default_size or 0, log_warnings=False) for one in specs]
     prepared = [prepare(scene, load_target(SOLVERS[solver])()) for scene in scenes]
     seconds, limited = np.full((len(specs), frames), np.inf), np.zeros(len(specs), int)
@@ -99,9 +104,9 @@ def simulate_interleaved(
 def measure_idle(size: int, solver: str, frames: int, rounds: int) -> list[dict[str, Any]]:
     """Measure the ratio of a step with each floor far below to one without a floor."""
     spec = load_scene(CONFIGS / "scenes" / "hanging-cloth.yaml")
-    more: list[tuple[SceneEffect, ...]] = [(), *((build_floor(kind, -5.0),) for kind in FLOORS)]
+    floors: list[tuple[SceneEffect, ...]] = [(), *((build_floor(kind, -5.0),) for kind in FLOORS)]
     motions = simulate_interleaved(
-        [spec.model_copy(update={"effects": (*spec.effects, *one)}) for one in more], size, solver, frames, rounds
+        [spec.model_copy(update={"effects": (*spec.effects, *floor)}) for floor in floors], size, solver, frames, rounds
     )
     without, *others = (float(motion.step_seconds[NUM_WARMUP_STEPS:].sum()) for motion in motions)
     return [{"idle_ratio": one / without} for one in others]
@@ -116,7 +121,7 @@ def measure_resting(size: int, solver: str, frames: int, rounds: int) -> list[di
     return [
         {
             "step_milliseconds": 1e3 * float(np.median(motion.step_seconds[-frames // 3 :])),
-            "height_error_mm": 1e3 * (_mean_lowest(motion.positions, size) - floor - MIN_DISTANCE),
+            "height_error_mm": 1e3 * (_compute_lowest_height(motion.positions, size) - floor - MIN_DISTANCE),
         }
         for motion in motions
     ]
@@ -143,13 +148,13 @@ def _replace_contact(spec: SceneSpec, floor: float, min_distance: float = MIN_DI
     return [spec.model_copy(update={"effects": (*others, build_floor(kind, floor, min_distance))}) for kind in FLOORS]
 
 
-def _mean_lowest(p: Positions, size: int) -> float:
+def _compute_lowest_height(p: Positions, size: int) -> float:
     """Return the mean height [m] of the lowest layer of a block with `size` vertices a side."""
     return float(np.sort(p[:, 1])[: size * size].mean())
 
 
 def measure_solver(solver: str, size: int, block_size: int, frames: int, rounds: int) -> list[dict[str, Any]]:
-    """Measure all with one solver: a row for each scene and floor."""
+    """Measure all scenes with one solver: a row for each scene and floor."""
     measured = {
         "hanging-cloth": measure_idle(size, solver, 16, rounds),
         "block-drop": measure_resting(block_size, solver, frames, rounds),
@@ -162,7 +167,7 @@ def measure_solver(solver: str, size: int, block_size: int, frames: int, rounds:
     ]
 
 
-def tabulate(rows: Sequence[dict[str, Any]]) -> Table:
+def build_table(rows: Sequence[dict[str, Any]]) -> Table:
     """Build the table of all rows, with a column for each floor."""
     table = Table("solver", "measured", *FLOORS, box=SIMPLE_HEAD)
     table.title = f"the same floor as half spaces and as barriers; {describe_machine().cpu}"
@@ -173,9 +178,9 @@ def tabulate(rows: Sequence[dict[str, Any]]) -> Table:
         **{(name, f"{name}: limited steps; depth, mm"): "{num_limited_steps}; {depth_mm:.3g}" for name in HARD_CASES},
     }
     for solver in dict.fromkeys(row["solver"] for row in rows):
-        for (scene, words), form in lines.items():
+        for (scene, quantity), form in lines.items():
             found = [row for row in rows if (row["solver"], row["scene"]) == (solver, scene)]
-            table.add_row(solver, words, *(form.format_map(row) for row in found))
+            table.add_row(solver, quantity, *(form.format_map(row) for row in found))
     return table
 
 
@@ -193,7 +198,7 @@ def main() -> None:
     with limit_threads(1):
         for solver in options.solvers:
             rows += measure_solver(solver, options.size, options.block, options.frames, options.rounds)
-    Console(width=120).print(tabulate(rows))
+    Console(width=120).print(build_table(rows))
     config = CONFIGS / "scenes" / "block-drop.yaml"
     publish_rows(options.publish, config, "python -m tests.bench.half_spaces", rows, begin)
 

@@ -1,11 +1,11 @@
-"""What Newton's method does about indefinite Hessians: iterations, elements examined, and CPU time of each rule.
+"""Measure the treatments of indefinite Hessians in Newton's method: iterations, examined elements, and CPU time.
 
     python -m tests.bench.hessians [SCENE ...] [--repeats 3] [--publish results/published/hessians]
 
-The scenes of `configs/hessians.yaml`, with its limits. Rules alternate, frame by frame, in one process. The elements
-that a rule examines are stated as a share of all elements in all iterations, which `clamp` examines. CPU time is a
-multiple of that of the default, the median over the repeats, without what it takes to prepare. A rule that needs all
-iterations in some frame is marked by >.
+The scenes are those of `configs/hessians.yaml`, with its limits. The rules alternate frame by frame in one process. A
+cell has the iterations of a rule, the share of elements whose Hessians it examines, and its CPU time. The share is
+relative to all elements in all iterations, which `clamp` examines. The CPU time is relative to that of the default rule
+without preparation, the median over the repeats. The mark > denotes a rule that reaches the iteration limit in a frame.
 """
 
 from __future__ import annotations
@@ -44,32 +44,36 @@ RULES: tuple[IndefiniteStrategy, ...] = tuple(hessian_regularisation.REGULARISAT
 
 @dataclass
 class Tally:
-    """Work of a rule on a scene: iterations, CPU time [s], elements of all iterations, and those that it examined."""
+    """Work of a rule on a scene.
+
+    seconds: CPU time [s]; elements: in all iterations; examined: elements that the rule examined; is_converged: whether
+    no frame reached the iteration limit.
+    """
 
     iterations: int = 0
     seconds: float = 0.0
     elements: int = 0
     examined: int = 0
-    ended: bool = True
+    is_converged: bool = True
 
 
 @contextmanager
 def count_examined_elements() -> Iterator[list[int]]:
     """Yield a list that gains the number of elements that each projected Hessian examines."""
     examined: list[int] = []
-    filtered = Hessian.project_to_psd
+    project_to_psd = Hessian.project_to_psd
 
-    def counting(self: Hessian, by: PsdProjection) -> ProjectedHessian:
-        found = filtered(self, by)
+    def project_and_count(self: Hessian, projection: PsdProjection) -> ProjectedHessian:
+        found = project_to_psd(self, projection)
         examined.append(found.num_examined)
         return found
 
-    with patch.object(Hessian, "project_to_psd", counting):
+    with patch.object(Hessian, "project_to_psd", project_and_count):
         yield examined
 
 
 def measure_strategies(path: Path) -> dict[IndefiniteStrategy, Tally]:
-    """Solve a scene by each rule."""
+    """Simulate a scene by each rule, and return the work of each."""
     spec = load_scene(path)
     made = build_scene(spec, spec.default_size or 0)
     edges = sum(len(getattr(energy, "edges", ())) for energy in made.system.energies)
@@ -90,7 +94,7 @@ def measure_strategies(path: Path) -> dict[IndefiniteStrategy, Tally]:
             tally.examined += sum(examined)
             tally.iterations += solution.num_iterations
             tally.elements += solution.num_iterations * edges
-            tally.ended &= solution.termination_reason != "max-iter"
+            tally.is_converged &= solution.termination_reason != "max-iter"
     return tallies
 
 
@@ -102,7 +106,7 @@ def list_rows(path: Path, repeat: int) -> list[dict[str, Any]]:
             "strategy": rule,
             "repeat": repeat,
             "num_iterations": tally.iterations,
-            "is_converged": tally.ended,
+            "is_converged": tally.is_converged,
             "examined_share": tally.examined / tally.elements,
             "cpu_seconds": tally.seconds,
         }
@@ -112,10 +116,10 @@ def list_rows(path: Path, repeat: int) -> list[dict[str, Any]]:
 
 def format_cells(rows: list[dict[str, Any]]) -> Iterator[str]:
     """Yield the cells of a scene: iterations, share of examined elements, and ratio of times."""
-    usual = {row["repeat"]: row["cpu_seconds"] for row in rows if row["strategy"] == "shift-schedule"}
+    default = {row["repeat"]: row["cpu_seconds"] for row in rows if row["strategy"] == "shift-schedule"}
     for rule in RULES:
         own = [row for row in rows if row["strategy"] == rule]
-        ratio = median(row["cpu_seconds"] / usual[row["repeat"]] for row in own)
+        ratio = median(row["cpu_seconds"] / default[row["repeat"]] for row in own)
         share = f" {100 * own[0]['examined_share']:.0f} %" if own[0]["examined_share"] else ""
         yield f"{'' if own[0]['is_converged'] else '>'}{own[0]['num_iterations']}{share} {ratio:.2f}"
 
