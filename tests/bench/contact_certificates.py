@@ -1,11 +1,12 @@
-"""Certificates of contact from the rows of sweeps: in how many frames nothing intersects, and how many steps converged.
+"""Count frames without intersections, and converged steps, in the rows of sweeps with contact.
 
     springbench run configs/hard-touch.yaml
     python -m tests.bench.contact_certificates [results/hard-touch ...] [--publish FOLDER]
 
-A row states a run: its frames, those in which an exact test finds no edge that passes through a triangle, the steps
-that ended at their tolerance, and the reason of a run without frames. `springbench run
-configs/contact-certificates.yaml` simulates the touching scenes, in hours.
+A published row describes a run: the number of its frames, the number of frames in which an exact test finds no edge
+that intersects a triangle, the number of steps that reached their tolerance, and the reason why a run has no frames.
+The printed table has the sums by solver. `springbench run configs/contact-certificates.yaml` simulates the scenes in
+contact, which takes hours.
 """
 
 from __future__ import annotations
@@ -42,11 +43,11 @@ def main() -> None:
     table = Table("solver", "runs", "frames", "free of intersections", "steps", "converged", box=SIMPLE_HEAD)
     for solver in dict.fromkeys(row["solver"] for row in found):
         own = [row for row in found if row["solver"] == solver]
-        free, converged, frames = (
+        intersection_free, converged, frames = (
             sum(row[name] or 0 for row in own)
             for name in ("num_intersection_free_frames", "num_converged_steps", "num_frames")
         )
-        table.add_row(solver, *map(str, (len(own), frames, free, frames, converged)))
+        table.add_row(solver, *map(str, (len(own), frames, intersection_free, frames, converged)))
     Console(width=120).print(table)
     if options.publish:
         command = " ".join(

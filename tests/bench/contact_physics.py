@@ -1,13 +1,16 @@
-"""Contact against closed forms: Coulomb's law on a slope, creep below its angle, momentum, refinement of the thickness.
+"""Compare contact with closed forms: Coulomb's law on a slope, creep, momentum, and refinement of the thickness.
 
-    python -m tests.bench.contact_physics [--publish results/published/contact-physics]
+python -m tests.bench.contact_physics [--publish results/published/contact-physics]
 
-A vertex of 1 kg at rest on a slope of 1:2 slides for a second, or sticks. n steps of implicit Euler lead
-n (n + 1)/2 dt^2 g (sin - mu cos) down the slope, the exact motion g (sin - mu cos) t^2/2. What sticks creeps at
-tan/mu times `eps_v`. Two sheets collide in free space, by implicit Euler. Of
-the steps the largest change of momentum counts, relative to the sum of |m v|, and the largest x_(n+1) x m (v_(n+1) -
-v_n), which is 0 without a torque, relative to the sum of |x x m v|. The thickness of contact is halved for a sheet that
-sinks onto a ball (`tests.contact_refinement`).
+slide               distance that a vertex of 1 kg slides down a slope of 1:2 from rest in a second:
+                    n (n + 1)/2 dt^2 g (sin - mu cos) by n steps of implicit Euler, g (sin - mu cos) t^2/2 exactly
+creep speed         speed of the vertex with a friction coefficient above the slope's tangent: tan/mu times `eps_v`
+momentum            two sheets collide in free space, by implicit Euler: largest change of momentum in a step,
+                    relative to the sum of |m v|
+angular momentum    of the same sheets: largest sum of x_(n+1) x m (v_(n+1) - v_n) in a step, which is 0 without a
+                    torque, relative to the sum of |x x m v|
+refinement          distance of the positions for successive thicknesses of contact, which are halved, of a sheet
+                    that sinks onto a ball (`tests.contact_refinement`)
 """
 
 from __future__ import annotations
@@ -38,14 +41,14 @@ from tests.scene_builders import build_test_scene
 CONFIG = Path(__file__).parents[2] / "configs" / "scenes" / "block-slide.yaml"
 GRAVITY, SLOPE, NUM_STEPS, THICKNESS = 9.81, 0.5, 60, 0.005
 SIN, COS = SLOPE / np.hypot(1.0, SLOPE), 1.0 / np.hypot(1.0, SLOPE)
-SLIPS, STICKS = 0.4, 0.6
-"""Coefficients of friction on either side of the slope's tangent."""
+SLIDING_FRICTION, STICKING_FRICTION = 0.4, 0.6
+"""Coefficients of friction below and above the slope's tangent."""
 SHEET_VELOCITY = (0.1, -2.0, 0.0)
 """Velocity of the upper sheet of a collision [m/s]."""
 
 
 def simulate_vertex(friction: float) -> list[SimulationStep]:
-    """Simulate a vertex at rest on the slope for a second; the x axis points down the slope."""
+    """Simulate a vertex on the slope from rest for a second; the x axis points down the slope."""
     down = GravityEffect(acceleration=(GRAVITY * SIN, -GRAVITY * COS, 0.0))
     plane = {"kind": "plane", "point": (0.0, -THICKNESS, 0.0)}
     ground = ContactEffect.model_validate({"obstacles": [plane], "min_distance": THICKNESS, "friction": friction})
@@ -56,7 +59,7 @@ def simulate_vertex(friction: float) -> list[SimulationStep]:
 
 
 def measure_collision(friction: float) -> tuple[float, float]:
-    """Return the largest change of momentum and of angular momentum in a step of two sheets that collide, relative."""
+    """Return the largest relative changes of momentum and of angular momentum in a step of two colliding sheets."""
     contact = SelfContactEffect(min_distance=0.02, friction=friction)
     sheets = StackMesh(layer_spacing=0.05)
     scene = build_test_scene(sheets, SpringsEffect(stretch=100.0, shear=20.0), contact, size=5)
@@ -75,11 +78,12 @@ def measure_collision(friction: float) -> tuple[float, float]:
     for step in steps:
         now = step.state.motion
         changed, momentum = mass * (now.velocity - v), mass * now.velocity
-        turned = np.cross(now.positions, changed).sum(axis=0), np.cross(now.positions, momentum)
+        angular_change = np.cross(now.positions, changed).sum(axis=0)
+        angular_momentum = np.cross(now.positions, momentum)
         changes.append(
             (
                 float(np.linalg.norm(changed.sum(axis=0)) / np.linalg.norm(momentum, axis=1).sum()),
-                float(np.linalg.norm(turned[0]) / np.linalg.norm(turned[1], axis=1).sum()),
+                float(np.linalg.norm(angular_change) / np.linalg.norm(angular_momentum, axis=1).sum()),
             )
         )
         v = now.velocity.copy()
@@ -88,9 +92,9 @@ def measure_collision(friction: float) -> tuple[float, float]:
 
 
 def measure_physics() -> list[dict[str, Any]]:
-    """Return a row for each quantity: its value, and that of the closed form where there is one."""
-    exact = 0.5 * GRAVITY * (SIN - SLIPS * COS)
-    slide, creep = simulate_vertex(SLIPS)[-1], simulate_vertex(STICKS)[-1]
+    """Measure all quantities: a row for each with its value, and the values of closed forms where they exist."""
+    exact = 0.5 * GRAVITY * (SIN - SLIDING_FRICTION * COS)
+    slide, creep = simulate_vertex(SLIDING_FRICTION)[-1], simulate_vertex(STICKING_FRICTION)[-1]
     rows: list[dict[str, Any]] = [
         {
             "quantity": "slide",

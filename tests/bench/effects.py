@@ -1,12 +1,12 @@
-"""What an iteration costs with an effect, over one without: each effect by each solver, side by side.
+"""Measure the time of an iteration with an effect over one without, for each effect and solver.
 
     python -m tests.bench.effects [--sizes 33] [--contact-sizes 33] [--rounds 3] [--frames 8] [--effects all]
         [--publish FOLDER] [SOLVER ...]
 
-The hanging cloth is simulated to a tolerance of 1e-6 (see
-`springbench.harness.experiments.ablation.iteration_overhead`). Each cell states the ratio, the time of an iteration and
-the limit of the ratio. `--contact-sizes` adds contact of surfaces with nothing near, by the solvers of CONTACT_SOLVERS.
-These are the published studies of single effects and of all together:
+The hanging cloth is simulated with and without the effect, interleaved, to a tolerance of 1e-6 (see
+`springbench.harness.experiments.ablation.iteration_overhead`). A cell has the ratio, the time of an iteration and the
+limit of the ratio; the mark ! denotes a ratio above its limit. `--contact-sizes` adds idle contact of surfaces, by the
+solvers of CONTACT_SOLVERS. These commands publish the studies of single effects and of all together:
 
     python -m tests.bench.effects --sizes 33 64 --contact-sizes 33 64 128 --publish results/published/prices
     python -m tests.bench.effects --effects all --publish results/published/all-effects
@@ -51,7 +51,7 @@ LIMITS = {
     "lbfgs": (1.05, 1.6, 1.6, 1.02, 3.0),
     "vbd": (1.1, 1.5, 2.0, 1.1, 4.0),
 }
-"""Largest ratios, by solver and by kind of effect."""
+"""Target of the ratio, by solver and by kind of effect."""
 
 GATES = {
     "newton": (1.5, 2.0, 4.0, 1.3, 5.0),
@@ -60,11 +60,11 @@ GATES = {
     "lbfgs": (1.5, 2.0, 3.0, 1.3, 5.5),
     "vbd": (1.5, 2.0, 3.0, 1.5, 10.0),
 }
-"""What no price may reach, with room above what `results/README.md` has."""
+"""Largest ratio that the tests accept, by solver and by kind of effect, with a margin above the published ratios."""
 
 
 def measure_cell(config: Path, size: int, effect: str, solver: str, frames: int, rounds: int) -> dict[str, Any]:
-    """Return the row of an effect with a solver."""
+    """Measure an effect with a solver, and return its row; `refused` states why there is no ratio."""
     scene, made = load_scene(config), load_target(SOLVERS[solver])()
     row: dict[str, Any] = {"scene": config.stem, "size": size, "effect": effect, "solver": solver}
     try:
@@ -78,16 +78,16 @@ def measure_cell(config: Path, size: int, effect: str, solver: str, frames: int,
 
 
 def describe_cell(row: dict[str, Any]) -> str:
-    """Return a row's cell of the table."""
+    """Format the table cell of a row."""
     if row["refused"]:
         return "refused"
     limit = LIMITS[row["solver"]][KINDS[row["effect"]]]
-    beyond = "" if row["ratio"] <= limit else " !"
-    return f"{row['ratio']:.2f} ({1e3 * row['iteration_seconds']:.3g} ms; limit {limit:g}{beyond})"
+    mark = "" if row["ratio"] <= limit else " !"
+    return f"{row['ratio']:.2f} ({1e3 * row['iteration_seconds']:.3g} ms; limit {limit:g}{mark})"
 
 
 def main() -> None:
-    """Print each effect as it is measured, then a table of each scene and size."""
+    """Print each effect when it is measured, then a table of each scene and size."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("solvers", nargs="*", default=DEFAULT_SOLVERS, metavar="SOLVER")
     for name, given in (("--rounds", 3), ("--frames", 8)):

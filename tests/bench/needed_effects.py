@@ -1,10 +1,10 @@
-"""How far leaving out each effect of a scene moves its vertices, and how large the scene's own error is.
+"""Measure the displacement of vertices when an effect of a scene is left out, compared with the scene's own error.
 
     python -m tests.bench.needed_effects [SCENE ...] [--publish results/published/needed-effects]
 
-Ablations (`springbench ablate`) of ten scenes, at sizes at which each takes seconds. Displacements are in mean rest
-lengths. An effect is needed if leaving it out moves some vertex further than the scene's own error: that of its solver
-or of its time step, whichever is larger.
+Ten scenes are ablated (`springbench ablate`), at sizes that take seconds. The displacement of an effect is the largest
+distance of a vertex from its position with all effects, in mean rest lengths. The scene's own error is the larger one
+of the solver's error and the error of the time step. An effect is needed if its displacement exceeds that error.
 """
 
 from __future__ import annotations
@@ -59,11 +59,11 @@ def measure_scene(name: str) -> list[dict[str, Any]]:
         path = run_ablation(sweep, Path(folder), SilentDisplay(), lambda line: None, with_pairs=False, isolated=False)
         rows = read_ablation(path)
     own_error, _ = largest_known_error(rows)
-    (whole,) = select_kind(rows, "full-scene")
+    (full_scene,) = select_kind(rows, "full-scene")
     return [
         {
-            "scene": whole["scene"],
-            "size": whole["size"],
+            "scene": full_scene["scene"],
+            "size": full_scene["size"],
             "effect": row["name"],
             "status": row["status"],
             "displacement_max": row["displacement_max"],
@@ -86,8 +86,8 @@ def main() -> None:
         print(name, file=sys.stderr, flush=True)
         for row in measure_scene(name):
             rows.append(row)
-            moved = row["status"] if row["displacement_max"] is None else f"{row['displacement_max']:.2g}"
-            table.add_row(row["scene"], str(row["size"]), f"{row['own_error']:.2g}", row["effect"], moved)
+            displacement = row["status"] if row["displacement_max"] is None else f"{row['displacement_max']:.2g}"
+            table.add_row(row["scene"], str(row["size"]), f"{row['own_error']:.2g}", row["effect"], displacement)
     get_output_console().print(table)
     config = CONFIGS / "scenes" / "hanging-cloth.yaml"
     publish_rows(options.publish, config, "python -m tests.bench.needed_effects", rows, begin, is_timed=False)

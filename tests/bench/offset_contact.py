@@ -1,21 +1,22 @@
-"""Offset geometric contact (`vbd-ogc`) compared with barriers: time, penetration, and the error that it leaves.
+"""Measure offset geometric contact (`vbd-ogc`) compared with barriers: time, collisions and error.
 
     python -m tests.bench.offset_contact [--rounds 2] [--scenes SCENE ...] [--publish results/published/offset-contact]
 
-Rough motions: each solver simulates the first frames of a scene, all in turn step by step on one thread; of each step
-the least processor time of the rounds counts. Barrier solvers end at a relative residual of 1e-3 or after 100
-iterations, `vbd-ogc` after a fixed number.
+Rough motions: each solver simulates the first frames of a scene. The solvers alternate step by step on one thread; the
+time of a step is the least processor time of the rounds. Solvers with barriers stop at a relative residual of 1e-3 or
+after 100 iterations, `vbd-ogc` after a fixed number.
 
-    collisions      frames with an edge through a triangle or a pair within its minimum distance, and pairs of
-                    consecutive frames whose linear path ipctk's continuous collision detection rejects
-    error           of the last positions, root mean square distance from `hybrid` to a residual of 1e-6 [mm]
+    bad frames      frames with an edge that intersects a triangle or a pair within its minimum distance
+    rejected paths  pairs of consecutive frames whose linear path is rejected by continuous collision detection of ipctk
+    error           root mean square distance of the last positions from those of `hybrid` with residuals of 1e-6 [mm]
 
-One step: that of `hybrid` at the last frame, solved in 10 to 300 iterations from the same start.
+One step: the step after the last frame of `hybrid`, solved in 10 to 300 iterations from the same start.
 
     residual        of the barrier objective, relative to the start
     error           root mean square distance from the solution of `newton`, friction included [mm]
-    change          the same from the iterate after the largest number of iterations: it falls if there is a fixed point
-    radius          the error without friction, where contacts act within a fraction of the minimum distance
+    change          root mean square distance from the iterate after the largest number of iterations [mm], which
+                    decreases with the number of iterations if there is a fixed point
+    radius          the error without friction, for activation distances that are a fraction of the minimum distance
 """
 
 from __future__ import annotations
@@ -54,10 +55,10 @@ SCENES: dict[str, tuple[str, int, int]] = {
     "gathered-curtain": ("contact-accuracy", 9, 20),
     "ten-sheets": ("touch", 3, 8),
 }
-"""Folder, size and frames of each scene: ropes on a block, a cloth in folds, layers that press each other."""
+"""Folder, size and frames of each scene: ropes on a block, a folded cloth, and layers under pressure."""
 
 
-class Contender(NamedTuple):
+class StoppedSolver(NamedTuple):
     """A solver with its stop rule."""
 
     solver: Solver
@@ -65,14 +66,14 @@ class Contender(NamedTuple):
 
 
 BARRIERS = StopRule(100, 1e-3)
-CONTENDERS: dict[str, Contender] = {
-    "vbd-ogc, 20": Contender(OffsetContactDescent(), StopRule(20)),
-    "vbd-ogc, 100": Contender(OffsetContactDescent(), StopRule(100)),
-    "vbd": Contender(VertexBlockDescent(), BARRIERS),
-    "hybrid": Contender(HybridNewton(), BARRIERS),
-    "newton": Contender(NewtonSolver(), BARRIERS),
+MOTION_SOLVERS: dict[str, StoppedSolver] = {
+    "vbd-ogc, 20": StoppedSolver(OffsetContactDescent(), StopRule(20)),
+    "vbd-ogc, 100": StoppedSolver(OffsetContactDescent(), StopRule(100)),
+    "vbd": StoppedSolver(VertexBlockDescent(), BARRIERS),
+    "hybrid": StoppedSolver(HybridNewton(), BARRIERS),
+    "newton": StoppedSolver(NewtonSolver(), BARRIERS),
 }
-REFERENCE = Contender(HybridNewton(), StopRule(300, 1e-6))
+REFERENCE = StoppedSolver(HybridNewton(), StopRule(300, 1e-6))
 STEP_SOLVERS: dict[str, Solver] = {
     "vbd-ogc": OffsetContactDescent(),
     "vbd-ogc, redetection_fraction 0": OffsetContactDescent(redetection_fraction=0.0),
@@ -90,19 +91,19 @@ class Motion(NamedTuple):
     mean_iterations: float
 
 
-def simulate_interleaved(scene: Scene, frames: int, contenders: Sequence[Contender], rounds: int) -> list[Motion]:
-    """Simulate a scene by several solvers step by step in turn, and return their motions."""
-    prepared = [prepare(scene, one.solver) for one in contenders]
-    seconds, counts = np.full((len(contenders), frames), np.inf), np.zeros((len(contenders), frames))
+def simulate_interleaved(scene: Scene, frames: int, solvers: Sequence[StoppedSolver], rounds: int) -> list[Motion]:
+    """Simulate a scene by several solvers interleaved step by step, and return their motions."""
+    prepared = [prepare(scene, one.solver) for one in solvers]
+    seconds, counts = np.full((len(solvers), frames), np.inf), np.zeros((len(solvers), frames))
     positions: list[list[Positions]] = []
     for number in range(rounds):
-        positions = [[] for _ in contenders]
+        positions = [[] for _ in solvers]
         steps = [
             iter(simulate_scene(scene, made, one.stop, initial_guess="extrapolated", frames=frames))
-            for made, one in zip(prepared, contenders, strict=True)
+            for made, one in zip(prepared, solvers, strict=True)
         ]
         for k in range(frames):
-            for j in range(len(contenders)) if (k + number) % 2 else reversed(range(len(contenders))):
+            for j in range(len(solvers)) if (k + number) % 2 else reversed(range(len(solvers))):
                 began = thread_time()
                 step = next(steps[j])
                 seconds[j, k] = min(seconds[j, k], thread_time() - began)
@@ -168,7 +169,7 @@ def simulate_reference(name: str, radius_ratio: float | None = None) -> Referenc
 def measure_motions(name: str, reference: Reference, rounds: int) -> list[dict[str, Any]]:
     """Measure the motion of a scene by each solver: a row for each."""
     scene, frames = reference.scene, SCENES[name][2]
-    motions = simulate_interleaved(scene, frames, list(CONTENDERS.values()), rounds)
+    motions = simulate_interleaved(scene, frames, list(MOTION_SOLVERS.values()), rounds)
     return [
         {
             "kind": "motion",
@@ -182,15 +183,15 @@ def measure_motions(name: str, reference: Reference, rounds: int) -> list[dict[s
             "num_rejected_paths": count_rejected_paths(scene, motion.positions),
             "error_mm": measure_distance_mm(motion.positions[-1], reference.end_positions),
         }
-        for solver, motion in zip(CONTENDERS, motions, strict=True)
+        for solver, motion in zip(MOTION_SOLVERS, motions, strict=True)
     ]
 
 
 def measure_step(name: str, reference: Reference) -> list[dict[str, Any]]:
     """Measure one step of a scene by numbers of iterations: a row for each solver and number."""
     problem = reference.problem
-    gauge: Any = CompiledLocalGlobal().prepare(reference.scene.system)
-    residual = gauge.build_residual(problem)
+    local_global: Any = CompiledLocalGlobal().prepare(reference.scene.system)
+    residual = local_global.build_residual(problem)
     start = residual(problem.current_positions)
     rows: list[dict[str, Any]] = []
     for solver, method in STEP_SOLVERS.items():
@@ -232,7 +233,7 @@ def measure_radii(name: str) -> list[dict[str, Any]]:
     return rows
 
 
-def tabulate_motions(rows: Sequence[dict[str, Any]]) -> Table:
+def build_motion_table(rows: Sequence[dict[str, Any]]) -> Table:
     """Build the table of motions."""
     table = Table(
         "scene", "solver", "iterations", "ms a step", "bad frames", "rejected paths", "error, mm", box=SIMPLE_HEAD
@@ -251,7 +252,7 @@ def tabulate_motions(rows: Sequence[dict[str, Any]]) -> Table:
     return table
 
 
-def tabulate_steps(rows: Sequence[dict[str, Any]]) -> Table:
+def build_step_table(rows: Sequence[dict[str, Any]]) -> Table:
     """Build the table of single steps."""
     table = Table("scene", "solver", "iterations", "residual", "error, mm", "change, mm", box=SIMPLE_HEAD)
     for row in rows:
@@ -261,7 +262,7 @@ def tabulate_steps(rows: Sequence[dict[str, Any]]) -> Table:
 
 
 def main() -> None:
-    """Print both tables."""
+    """Print both tables and the errors by radius for each scene."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rounds", type=int, default=2)
     parser.add_argument("--scenes", nargs="+", choices=list(SCENES), default=list(SCENES))
@@ -272,13 +273,13 @@ def main() -> None:
         for name in options.scenes:
             reference = simulate_reference(name)
             motions += measure_motions(name, reference, options.rounds)
-            Console(width=120).print(tabulate_motions(motions[-len(CONTENDERS) :]))
+            Console(width=120).print(build_motion_table(motions[-len(MOTION_SOLVERS) :]))
             steps += measure_step(name, reference)
-            Console(width=120).print(tabulate_steps(steps[-len(STEP_SOLVERS) * len(ITERATIONS) :]))
+            Console(width=120).print(build_step_table(steps[-len(STEP_SOLVERS) * len(ITERATIONS) :]))
             radii += measure_radii(name)
             for row in radii[-len(RADIUS_RATIOS) * len(RADIUS_ITERATIONS) :]:
-                words = f"{name}: radius {row['radius_ratio']:g}, {row['iterations']:.0f} iterations"
-                Console(width=120).print(f"{words}: {row['error_mm']:.3g} mm")
+                title = f"{name}: radius {row['radius_ratio']:g}, {row['iterations']:.0f} iterations"
+                Console(width=120).print(f"{title}: {row['error_mm']:.3g} mm")
             config, command = CONFIGS / "contact-accuracy.yaml", "python -m tests.bench.offset_contact"
             publish_rows(options.publish, config, command, motions + steps + radii, begin)
 

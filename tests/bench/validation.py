@@ -1,9 +1,10 @@
-"""Closed forms and textile tests by Newton's method, and what the drape of five fabrics depends on.
+"""Measure errors relative to closed forms, and textile tests of five fabrics and of variants of them.
 
     python -m tests.bench.validation [CASE ...] [--publish results/published/validation]
 
-The cases are those of `springbench validate`. The drape test of each fabric is repeated with one change at a time:
-closer lines, a tenth of the shear stiffness, and the smallest measured flexural rigidity.
+The cases are those of `springbench validate`, simulated by Newton's method. A textile test passes if its value is in
+the measured band. The drape test of each fabric is repeated with one change at a time: a finer mesh, a tenth of the
+shear stiffness, and the smallest measured flexural rigidity.
 """
 
 from __future__ import annotations
@@ -23,11 +24,11 @@ from tests.bench.scripted_study import describe_provenance, publish_rows
 FABRICS = Path(__file__).parents[2] / "harness" / "scenes" / "fabric_table.py"
 """File that states the measured fabrics."""
 FINER_SPACING = 0.005
-"""Spacing of lines [m] that divides the radii of the disc."""
+"""Spacing of mesh lines [m], a divisor of the disc's radii."""
 
 
 def list_changes(fabric: PublishedFabric) -> dict[str, tuple[PublishedFabric, float]]:
-    """Return the fabric and the spacing of lines [m] of each change to the drape test, by its name."""
+    """Return the fabric and the spacing of mesh lines [m] of each change to the drape test, by its name."""
     return {
         "finer lines": (fabric, FINER_SPACING),
         "a tenth of the shear": (fabric._replace(shear=0.1 * fabric.shear), DISC_SPACING),
@@ -36,7 +37,7 @@ def list_changes(fabric: PublishedFabric) -> dict[str, tuple[PublishedFabric, fl
 
 
 def measure_cases(names: Sequence[str]) -> Iterator[dict[str, Any]]:
-    """Yield rows: one for each closed form, and for each fabric its bending length and its drape coefficients."""
+    """Yield a row for each closed form, and for each bending length and drape coefficient of a fabric."""
     for name in names:
         (row,) = validate_solver(NewtonSolver(), [name])
         if row["kind"] == "closed form":
