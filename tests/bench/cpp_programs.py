@@ -1,10 +1,11 @@
-"""Processor time of local-global compiled by Numba, in three precisions, against two programs in C++.
+"""Measure local-global compiled by Numba, in three precisions, compared with two programs in C++.
 
     python -m tests.bench.cpp_programs [--sizes 10 32 64 128] [--rounds 15] [--publish results/published/cpp-programs]
 
-Fifty iterations of the first step of `configs/scenes/yardstick-cloth.yaml` by each, interleaved in one process on one
-thread. `eigen` is the assignment's program, with Eigen's SimplicialLLT; `cholmod` is a careful one, with CHOLMOD's
-factor. Both need a C++ compiler and their libraries (Debian: libeigen3-dev, libsuitesparse-dev). `springbench roofline
+Each program solves the first step of `configs/scenes/yardstick-cloth.yaml` in fifty iterations. All run interleaved in
+one process on one thread. The table has the median processor time of an iteration. `eigen` is the program of the
+assignment, with Eigen's SimplicialLLT; `cholmod` is an optimised program, with the factorisation of CHOLMOD. Both
+require a C++ compiler and their libraries (Debian: libeigen3-dev, libsuitesparse-dev). `springbench roofline
 configs/speed.yaml` compares larger meshes and the limits of the machine, by wall time on an idle machine.
 """
 
@@ -37,7 +38,7 @@ STOP = StopRule(50)
 
 
 def measure_size(size: int, num_rounds: int) -> list[dict[str, Any]]:
-    """Measure a mesh size: a row for each program and round."""
+    """Measure a mesh size: a row for each program and each round after the warm-up."""
     scene = build_scene(load_scene(SCENE), size)
     problem = build_problem(scene, build_initial_state(scene), "previous")
     prepared = {name: prepare(scene, solver) for name, solver in PROGRAMS.items()}

@@ -1,10 +1,11 @@
-"""Processor time of methods on one step, to a residual and for each iteration, interleaved.
+"""Measure the processor time of methods on one step: to a residual, and of an iteration.
 
     python -m tests.bench.iteration_costs [--repeats 5] [--publish results/published/iteration-costs]
 
-The first step of the scenes of `configs/claims.yaml`, to residuals of 1e-3, 1e-4 and 1e-6. All methods alternate in one
-process on one thread, without what they take to prepare. A method that takes seconds stops after 50 iterations, which
-suffices for the time of one.
+The steps are the first ones of the scenes of `configs/claims.yaml`, solved to residuals of 1e-3, 1e-4 and 1e-6. All
+methods run interleaved in one process on one thread, without their preparation. The table has the medians of the
+repeats; the mark > denotes a method that does not converge. A method that takes seconds stops after 50 iterations,
+which is sufficient for the time of one.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ METHODS: dict[str, dict[str, Any]] = {
 """Parameters of methods by their labels, which begin with the solver's name."""
 
 SCENES_OF_METHODS = {"jgs2, 24 rings": ("block-pressed-0",)}
-"""Scenes of methods that do not finish to prepare on all."""
+"""Scenes of methods whose preparation takes too long on the others."""
 
 RESIDUALS = (1e-3, 1e-4, 1e-6)
 MAX_ITERATIONS = {"jgs2": 50}

@@ -1,10 +1,10 @@
-"""What conjugate gradients are preconditioned by: iterations, and products with the Hessian, of each preconditioner.
+"""Count iterations and products with the Hessian of conjugate gradients by preconditioner.
 
     python -m tests.bench.preconditioners [SCENE ...] [--publish results/published/preconditioners]
 
-Scenes of `configs/hessians`, three steps each, to residuals of 1e-6, by `newton-cg` and `pncg`. A cell is iterations,
-and of `newton-cg` the products with the Hessian that these took, which are what a step costs but for the
-preconditioner. A solver that did not converge in all steps is marked by >. All are exact counts.
+Scenes of `configs/hessians` are simulated to residuals of 1e-6 by `newton-cg` and `pncg`. A cell has the number of
+iterations and, for `newton-cg`, the number of products with the Hessian, which take most of the time without the
+preconditioner. The mark > denotes a solver that does not converge in all steps. All counts are exact.
 """
 
 from __future__ import annotations
@@ -45,16 +45,19 @@ def count_work(path: Path, solver: Solver) -> dict[str, Any]:
     made = build_scene(spec, spec.default_size or 0)
     products, multiply = [0], Hessian.matvec
 
-    def counting(self: Hessian, x: Positions) -> Positions:
+    def count_and_multiply(self: Hessian, x: Positions) -> Positions:
         products[0] += 1
         return multiply(self, x)
 
-    iterations, ended = 0, True
-    with patch.object(Hessian, "matvec", counting), patch.object(newton_cg, "_compiled_factor", lambda metric: None):
+    iterations, is_converged = 0, True
+    with (
+        patch.object(Hessian, "matvec", count_and_multiply),
+        patch.object(newton_cg, "_compiled_factor", lambda metric: None),
+    ):
         for step in simulate_scene(made, prepare(made, solver), STOP, initial_guess="previous", frames=spec.frames):
             iterations += step.solution.num_iterations
-            ended &= step.solution.termination_reason != "max-iter"
-    return {"num_iterations": iterations, "num_products": products[0], "is_converged": ended}
+            is_converged &= step.solution.termination_reason != "max-iter"
+    return {"num_iterations": iterations, "num_products": products[0], "is_converged": is_converged}
 
 
 def format_counts(row: dict[str, Any]) -> str:

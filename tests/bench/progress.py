@@ -1,9 +1,10 @@
-"""Compare the remaining times that a command states with the time at which it ends.
+"""Compare the remaining times that a command prints with the time at which it ends.
 
     python -m tests.bench.progress reproduce hard --quick --seed 1
 
-The arguments are those of `springbench`. All lines pass through, with the seconds since the start. At the end the
-estimates of the second half are listed that are wrong. Exit code 1: there are some.
+The arguments are those of `springbench`. All lines of its output are printed with the seconds since the start. At the
+end the wrong estimates of the second half are listed: those that differ from the true remaining time by more than a
+factor of MAX_FACTOR and by more than MIN_SHARE of the total time. The exit code is 1 if there are any.
 """
 
 from __future__ import annotations
@@ -14,9 +15,9 @@ import sys
 from time import perf_counter
 
 MAX_FACTOR = 2.0
-"""Accepted factor between an estimate and the true remaining time, from half of the total time on."""
+"""Accepted factor between an estimate and the true remaining time, in the second half of the total time."""
 MIN_SHARE = 0.1
-"""Share of the total time below which a difference is not noticed: near the end a single run decides."""
+"""Accepted difference as a share of the total time: near the end a single run determines the remaining time."""
 
 _ESTIMATE = re.compile(r"about (\d+) (s|min) left")
 
@@ -25,7 +26,7 @@ def is_estimate_wrong(estimate: float, elapsed: float, total: float) -> bool:
     """Return whether an estimate of the remaining time of a command was wrong.
 
     Args:
-        estimate: remaining time that was stated [s].
+        estimate: remaining time that was printed [s].
         elapsed: time since the start [s].
         total: time from start to end [s].
     """
@@ -36,7 +37,7 @@ def is_estimate_wrong(estimate: float, elapsed: float, total: float) -> bool:
 
 
 def record_estimates(arguments: list[str]) -> tuple[list[tuple[float, float]], float]:
-    """Run `springbench`; return the estimates [s] with the seconds since the start, and the total time [s]."""
+    """Run `springbench`, and return its estimates as (elapsed, estimate) [s], and the total time [s]."""
     start, found = perf_counter(), list[tuple[float, float]]()
     command = [sys.executable, "-u", "-m", "springbench", *arguments]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as process:
@@ -44,13 +45,13 @@ def record_estimates(arguments: list[str]) -> tuple[list[tuple[float, float]], f
         for line in process.stdout:
             elapsed = perf_counter() - start
             print(f"{elapsed:8.1f} s  {line}", end="", flush=True)
-            if stated := _ESTIMATE.search(line):
-                found.append((elapsed, float(stated[1]) * (60.0 if stated[2] == "min" else 1.0)))
+            if match := _ESTIMATE.search(line):
+                found.append((elapsed, float(match[1]) * (60.0 if match[2] == "min" else 1.0)))
     return found, perf_counter() - start
 
 
 def main() -> None:
-    """Run the command of the command line."""
+    """Run the command of the command line, and print its wrong estimates."""
     estimates, total = record_estimates(sys.argv[1:])
     wrong = [one for one in estimates if is_estimate_wrong(one[1], one[0], total)]
     late = sum(elapsed >= 0.5 * total for elapsed, _ in estimates)
