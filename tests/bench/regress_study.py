@@ -1,8 +1,11 @@
-"""How often `springbench regress` is wrong on this machine, and which slowdowns it finds.
+"""Measure the error rates of `springbench regress` on this machine, and the slowdowns that it detects.
 
-python -m tests.bench.regress_study record SAMPLES CONFIG    blocks of two processes of the same code
-python -m tests.bench.regress_study replay SAMPLES...        rates of the verdicts of replayed tests
-python -m tests.bench.regress_study live RESULTS CONFIG      real tests of the same code
+    python -m tests.bench.regress_study record SAMPLES CONFIG    record blocks of two processes of the same code
+    python -m tests.bench.regress_study replay SAMPLES...        compute rates of verdicts of replayed tests
+    python -m tests.bench.regress_study live RESULTS CONFIG      run real tests of the same code
+
+`tests.bench.replay_study` defines blocks and replays, and `tests.bench.live_study` real tests. A verdict `fail` is
+wrong without a slowdown; a verdict `pass` is wrong for a slowdown above the limit.
 """
 
 from __future__ import annotations
@@ -53,7 +56,7 @@ app = typer.Typer(
 )
 
 SLOWDOWN_CASES = ((1.0, 1.03), (1.1, 1.03), (1.05, 1.03), (1.02, 1.01))
-"""Slowdowns, the first of none, and the limits of the tests that should detect them."""
+"""Pairs of a slowdown and the largest ratio that the test accepts; 1 is no slowdown."""
 
 StudyConfig = Annotated[Path, typer.Argument(help="A scene or a sweep, whose runs are compared with themselves.")]
 BackgroundLoad = Annotated[str, typer.Option(help="Background load: nothing, busy or bursty.")]

@@ -1,9 +1,12 @@
-"""Error rates of the performance tests, by replay of recorded blocks.
+"""Estimate error rates of performance regression tests by replay of recorded blocks.
 
-A record has the four times of each block of two processes of the same code, for several process pairs. A replay draws
-stretches of successive blocks, so that bursts of load are preserved, and concatenates them up to the budget. It
-multiplies the candidate's times by the slowdown and evaluates the test after every block. Every RESTART_SECONDS it
-continues with the blocks of another process pair. It confirms failures with further blocks, as the test itself does.
+    python -m tests.bench.regress_study record SAMPLES CONFIG
+    python -m tests.bench.regress_study replay SAMPLES...
+
+A record has the four times of each block of two processes A and B of the same code, for several process pairs. A replay
+draws stretches of successive blocks, so that bursts of load are preserved, and concatenates them up to the budget. It
+multiplies A's times by the slowdown and evaluates the test after every block. Every RESTART_SECONDS it continues with
+the blocks of another process pair. It confirms failures with further blocks, as the test itself does.
 """
 
 from __future__ import annotations
@@ -121,13 +124,13 @@ def record_blocks(
                     alive.enter_context(start_revisions(sides, request, ComparisonOptions(duration), lambda line: None))
                     for request in requests
                 ]
-                renewing = [LayoutRandomiser(racers.rebuild_work) for racers in pairs]
+                randomisers = [LayoutRandomiser(programs.rebuild_work) for programs in pairs]
                 until = perf_counter() + duration / num_process_pairs
                 for order in draw_block_orders():
-                    for request, racers, renewed in zip(requests, pairs, renewing, strict=True):
-                        at = perf_counter()
-                        calls = [{"A": racers.a, "B": racers.b}[who]() for who in order]
-                        renewed.rebuild_after(perf_counter() - at)
+                    for request, programs, randomiser in zip(requests, pairs, randomisers, strict=True):
+                        began = perf_counter()
+                        calls = [{"A": programs.a, "B": programs.b}[name]() for name in order]
+                        randomiser.rebuild_after(perf_counter() - began)
                         row = {
                             "benchmark": request.title,
                             "background_load": background_load,
@@ -135,11 +138,11 @@ def record_blocks(
                             "order": order,
                         }
                         row |= {f"call_{k}": call for k, call in enumerate(calls)}
-                        took = perf_counter() - at
+                        wall_seconds = perf_counter() - began
                         found.append(
                             row
                             | {
-                                "wall_seconds": took,
+                                "wall_seconds": wall_seconds,
                                 "load_average": os.getloadavg()[0],
                                 "injected_slowdown": injected_slowdown,
                             }
@@ -186,17 +189,17 @@ def _generate_load(is_bursty: bool, seed: int, parent_pid: int) -> None:
 def read_recorded_blocks(paths: Sequence[Path]) -> dict[tuple[str, str], list[RecordedBlocks]]:
     """Read the recorded process pairs by test and background load; raise InputError."""
     table = parquet_rows.read_rows(paths, RECORD_SCHEMA).to_pylist()
-    by: dict[tuple[str, str, int], list[dict[str, Any]]] = {}
+    grouped: dict[tuple[str, str, int], list[dict[str, Any]]] = {}
     for row in table:
-        by.setdefault((row["benchmark"], row["background_load"], row["process_pair"]), []).append(row)
+        grouped.setdefault((row["benchmark"], row["background_load"], row["process_pair"]), []).append(row)
     found: dict[tuple[str, str], list[RecordedBlocks]] = {}
-    for (gate, condition, _), turns in by.items():
-        times = np.array([[row[f"call_{k}"] for k in range(4)] for row in turns])
-        abba = np.array([row["order"] == "ABBA" for row in turns])[:, None]
+    for (gate, condition, _), blocks in grouped.items():
+        times = np.array([[row[f"call_{k}"] for k in range(4)] for row in blocks])
+        abba = np.array([row["order"] == "ABBA" for row in blocks])[:, None]
         outer, inner = times[:, [0, 3]], times[:, 1:3]
         a, b = np.where(abba, outer, inner), np.where(abba, inner, outer)
-        wall = float(np.mean([row["wall_seconds"] for row in turns]))
-        load = float(np.median([row["load_average"] for row in turns]))
+        wall = float(np.mean([row["wall_seconds"] for row in blocks]))
+        load = float(np.median([row["load_average"] for row in blocks]))
         start = RecordedBlocks(np.log(a.sum(axis=1) / b.sum(axis=1)), a, b, wall, load)
         found.setdefault((gate, condition), []).append(start)
     return found
@@ -221,24 +224,23 @@ def replay_tests(
         seed: seed of the random generator.
     Returns: rates of the verdicts.
     """
-    rng, answers, seconds = np.random.default_rng(seed), list[RegressionVerdict](), list[float]()
+    rng, verdicts, seconds = np.random.default_rng(seed), list[RegressionVerdict](), list[float]()
     for _ in range(num_replays):
-        answer, spent = _replay_test(rng, recorded_blocks, slowdown, sequential_test, budget)
-        if answer is RegressionVerdict.FAIL:
-            again, more = _replay_test(
+        verdict, spent = _replay_test(rng, recorded_blocks, slowdown, sequential_test, budget)
+        if verdict is RegressionVerdict.FAIL:
+            confirmation, more = _replay_test(
                 rng, recorded_blocks, slowdown, replace(sequential_test, alpha=CONFIRMATION_ALPHA), budget - spent
             )
-            answer, spent = (
-                (RegressionVerdict.FAIL if again is RegressionVerdict.FAIL else RegressionVerdict.INCONCLUSIVE),
-                spent + more,
-            )
-        answers.append(answer)
+            is_confirmed = confirmation is RegressionVerdict.FAIL
+            verdict = RegressionVerdict.FAIL if is_confirmed else RegressionVerdict.INCONCLUSIVE
+            spent += more
+        verdicts.append(verdict)
         seconds.append(spent)
-    fails, holds, undecided = (
-        answers.count(a) / num_replays
-        for a in (RegressionVerdict.FAIL, RegressionVerdict.PASS, RegressionVerdict.INCONCLUSIVE)
+    fail_rate, pass_rate, inconclusive_rate = (
+        verdicts.count(verdict) / num_replays
+        for verdict in (RegressionVerdict.FAIL, RegressionVerdict.PASS, RegressionVerdict.INCONCLUSIVE)
     )
-    return ReplayRates(fails, holds, undecided, float(np.median(seconds)))
+    return ReplayRates(fail_rate, pass_rate, inconclusive_rate, float(np.median(seconds)))
 
 
 def _replay_test(
@@ -255,14 +257,14 @@ def _replay_test(
     drawn, walls, left = list[FloatArray](), list[FloatArray](), budget
     while left > 0.0 or not drawn:
         start = recorded_blocks[int(rng.integers(len(recorded_blocks)))]
-        turns = _draw_stretches(
+        indices = _draw_stretches(
             rng, len(start.log_ratios), max(1, int(min(RESTART_SECONDS, left) / start.wall_seconds))
         )
-        drawn.append(start.log_ratios[turns])
-        walls.append(np.full(len(turns), start.wall_seconds))
+        drawn.append(start.log_ratios[indices])
+        walls.append(np.full(len(indices), start.wall_seconds))
         left -= RESTART_SECONDS
-    answer, used = find_first_verdict(sequential_test, np.log(slowdown) + np.concatenate(drawn))
-    return answer, float(np.concatenate(walls)[:used].sum())
+    verdict, used = find_first_verdict(sequential_test, np.log(slowdown) + np.concatenate(drawn))
+    return verdict, float(np.concatenate(walls)[:used].sum())
 
 
 def find_first_verdict(sequential_test: SequentialTest, log_ratios: FloatArray) -> tuple[RegressionVerdict, int]:
@@ -276,7 +278,9 @@ def find_first_verdict(sequential_test: SequentialTest, log_ratios: FloatArray) 
     Returns: the decision and its number of blocks, n if there is no decision.
     """
     limit, n = np.log(sequential_test.max_ratio), len(log_ratios)
-    needed = _tabulate_critical_counts(1 << n.bit_length(), sequential_test.alpha)[:n]  # few tables for many n
+    needed = _tabulate_critical_counts(1 << n.bit_length(), sequential_test.alpha)[
+        :n
+    ]  # powers of two, so that few tables are computed
     above, below = (np.cumsum(side) >= needed for side in (log_ratios > limit, log_ratios < limit))
     decided = np.flatnonzero(above | below)
     if not len(decided):
@@ -301,7 +305,7 @@ def _is_slower_by_asv(new: FloatArray, old: FloatArray) -> bool:
 
     The medians differ by that factor, and the Mann-Whitney test gives p < .002.
     """
-    from scipy.stats import mannwhitneyu  # a second, which tests of other parts need not wait for
+    from scipy.stats import mannwhitneyu  # the import takes a second, which other commands do not need
 
     return float(np.median(new)) > 1.05 * float(np.median(old)) and float(mannwhitneyu(new, old).pvalue) < 0.002
 
@@ -332,11 +336,11 @@ def replay_comparison(
         duration: seconds of one session.
         num_replays: number of comparisons.
     """
-    rng, said = np.random.default_rng(0), 0
+    rng, num_slower = np.random.default_rng(0), 0
     for _ in range(num_replays):
         start = recorded_blocks[int(rng.integers(len(recorded_blocks)))]
-        turns = max(1, min(int(duration / start.wall_seconds), len(start.a) // 2))
-        at = int(rng.integers(len(start.a)))
-        first, second = ((at + k * turns + np.arange(turns)) % len(start.a) for k in range(2))
-        said += is_slower(slowdown * start.a[first].ravel(), start.b[second].ravel())
-    return said / num_replays
+        num_blocks = max(1, min(int(duration / start.wall_seconds), len(start.a) // 2))
+        begin = int(rng.integers(len(start.a)))
+        first, second = ((begin + k * num_blocks + np.arange(num_blocks)) % len(start.a) for k in range(2))
+        num_slower += is_slower(slowdown * start.a[first].ravel(), start.b[second].ravel())
+    return num_slower / num_replays

@@ -1,10 +1,9 @@
-"""Baselines of performance targets.
+"""Measure baselines of performance targets (`python -m tests.bench.targets`).
 
-A baseline is a third-party integrator, or the cheapest fixed step size for the same error.
-
-Step sizes are divided by sqrt(2) until the error at the end is at most the requested one, for each integrator, solver
-and tolerance. The best combination is thus known in hindsight. Where none reaches the error within
-`MAX_SIMULATION_SECONDS`, the baseline is a lower bound of the cost.
+A baseline is a third-party integrator, or the cheapest fixed step size for the same error. For each integrator, solver
+and tolerance, the step size is divided by sqrt(2) until the error at the end is at most the requested one. The best
+combination is therefore the best in hindsight. If no combination reaches the error within `MAX_SIMULATION_SECONDS`, the
+baseline is a lower bound of the cost.
 """
 
 from __future__ import annotations
@@ -158,21 +157,21 @@ def _list_combinations(performance_target: PerformanceTarget) -> list[tuple[str,
     Solvers with their own integrator come first, since they are the quickest to run; they are listed once, as
     `substepping`.
     """
-    alone = {
+    is_substepping = {
         name: find_solver_info(load_target(SOLVER_TABLE[name]), name).is_substepping
         for name in performance_target.solver
     }
     every = performance_target.integrator or ()
-    own = [
+    substepping = [
         ("substepping", solver, None)
         for solver in performance_target.solver
-        if alone[solver] and "substepping" in every
+        if is_substepping[solver] and "substepping" in every
     ]
     others = [name for name in every if name != "substepping"]
     rest = product(
-        others, (solver for solver in performance_target.solver if not alone[solver]), performance_target.rtol
+        others, (solver for solver in performance_target.solver if not is_substepping[solver]), performance_target.rtol
     )
-    return [*own, *rest]
+    return [*substepping, *rest]
 
 
 def _build_lower_bound(

@@ -1,13 +1,13 @@
-"""Time of the cheapest method for an error, against a baseline, for each performance target of a config.
+"""Measure the time of the cheapest method for an error relative to a baseline, for each performance target of a config.
 
     python -m tests.bench.targets [CONFIG] [--results FOLDER]
 
-CONFIG is `targets.yaml` (five minutes) or `controlled.yaml` next to this file, or one like these. Rows are stored in
-FOLDER/<config>/targets.parquet. Exit code 1: a target is missed.
+CONFIG is `targets.yaml` (five minutes) or `controlled.yaml` next to this file, or another config of this form. Rows are
+stored in FOLDER/<config>/targets.parquet. The exit code is 1 if a target is missed.
 
-Both are timed in one process on one core, interleaved. The smallest CPU time of several rounds counts, including
-preparation. With `verify` the errors are computed from the reference solution. The method's error may then be at most
-twice the requested one. It may be below a third of it only where longer steps would be unstable.
+Method and baseline are timed interleaved in one process on one core. Their times are the smallest CPU times of several
+rounds, including preparation. With `verify` the errors are computed from the reference solution. The method's error may
+then be at most twice the requested one. It may be below a third of it only where larger step sizes would be unstable.
 """
 
 from __future__ import annotations
@@ -153,43 +153,43 @@ def _measure_target(
     reference_store: ReferenceStore,
     print_message: Callable[[str], None],
 ) -> TargetResult:
-    seen = compute_predictability_horizon(error_target, performance_target.error, print_message)
-    truth = (
+    horizon = compute_predictability_horizon(error_target, performance_target.error, print_message)
+    reference = (
         reference_store.load_trajectory(
             error_target.scene, error_target.size, [error_target.t_end], error=performance_target.error
         )
         if performance_target.target.verify
         else None
     )
-    answer = search_cheapest_method(error_target, performance_target.error, seen, print_message)
-    best, free = (
-        answer.best_trial,
+    found = search_cheapest_method(error_target, performance_target.error, horizon, print_message)
+    best, free_vertices = (
+        found.best_trial,
         error_target.build_scene(error_target.frame_seconds, "substepping").system.free_vertices,
     )
     end = best.trajectory.positions[-1]
-    other = find_baseline(
+    baseline = find_baseline(
         performance_target,
         error_target,
-        answer,
-        lambda p: truth.measure_error(-1, p) if truth else answer.compute_error(p, free),
+        found,
+        lambda p: reference.measure_error(-1, p) if reference else found.compute_error(p, free_vertices),
         print_message,
     )
-    ours, its = _time_interleaved(best, other)
+    seconds, baseline_seconds = _time_interleaved(best, baseline)
     return TargetResult(
-        *(performance_target, error_target.size, len(end), str(best.method), best.error_estimated, ours),
-        *(other.name, other.error, its, other.is_lower_bound),
-        error=truth.measure_error(-1, end) if truth else None,
-        note=answer.note,
+        *(performance_target, error_target.size, len(end), str(best.method), best.error_estimated, seconds),
+        *(baseline.name, baseline.error, baseline_seconds, baseline.is_lower_bound),
+        error=reference.measure_error(-1, end) if reference else None,
+        note=found.note,
     )
 
 
 def _time_interleaved(trial: Trial, baseline: TargetBaseline) -> tuple[float, float]:
     """Return the smallest CPU seconds of the method and of the baseline, timed interleaved."""
-    ours, its = list[float](), [baseline.seconds]
-    while len(ours) < MIN_ROUNDS or (sum(ours) < MIN_TOTAL_SECONDS and len(ours) < MAX_ROUNDS):
-        ours.append(_measure_cpu_seconds(trial.rerun_trial))
-        its += [baseline.rerun_timed()] if baseline.rerun_timed else []
-    return min(ours), min(its)
+    seconds, baseline_seconds = list[float](), [baseline.seconds]
+    while len(seconds) < MIN_ROUNDS or (sum(seconds) < MIN_TOTAL_SECONDS and len(seconds) < MAX_ROUNDS):
+        seconds.append(_measure_cpu_seconds(trial.rerun_trial))
+        baseline_seconds += [baseline.rerun_timed()] if baseline.rerun_timed else []
+    return min(seconds), min(baseline_seconds)
 
 
 def _measure_cpu_seconds(call: Callable[[], object]) -> float:
