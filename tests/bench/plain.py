@@ -1,6 +1,8 @@
-"""What the vectors of `springbench.solvers.simd` do, as one writes it in Numba: drop-in functions, the same arguments.
+"""Replace the vector functions of `springbench.solvers.simd` by plain Numba with the same arguments.
 
-Where a vector kernel refuses a bundle of springs, kernels go on with a plain one: refusing all of them is that.
+`tests.bench.vectors` compiles these functions and compares their time with that of the vector code. Kernels process a
+packet of springs by plain code if the vector function rejects it, so that a function that rejects all packets replaces
+the vector function.
 """
 
 from __future__ import annotations
@@ -16,38 +18,38 @@ from springbench.solvers.simd.spring_descent import SHORT_SPRING
 from springbench.solvers.simd.spring_packets import LANES, RHS_STRIDE
 
 
-def refuse(bundles, number, x, right, out):
-    """Springs: `springbench.solvers.kernels.spring_local_step.add_degenerate_packet` does the bundle."""
+def reject_packet(packets, number, x, right, out):
+    """Reject a packet: `springbench.solvers.kernels.spring_local_step.add_degenerate_packet` processes it."""
     return True
 
 
-def refuse_energy(bundles, shares, number, x, right, out):
-    """The objective and its gradient: `add_short` and `_short` do the bundle."""
+def reject_energy(packets, shares, number, x, right, out):
+    """Reject a packet: the plain code of the objective and its gradient processes it."""
     return SHORT_SPRING
 
 
-def energy(bundles, number, x, measure):
-    """Half of each spring's k |v|^2, and the anchor of each vertex."""
+def compute_squared_norm(packets, number, x, measure):
+    """Return the sum of k |v|^2 / 2 over the springs of a packet, and of each vertex's diagonal term."""
     own, neighbour, kinds, weights = (
-        bundles.row_offset,
-        bundles.neighbour_offset,
-        bundles.weight_offset,
-        bundles.weights,
+        packets.row_offset,
+        packets.neighbour_offset,
+        packets.weight_offset,
+        packets.weights,
     )
     total = 0.0
     for lane in range(LANES):
         i = own[LANES * number + lane]
         total += measure[LANES * number + lane] * (x[i] ** 2 + x[i + 1] ** 2 + x[i + 2] ** 2)
-        for entry in range(bundles.packet_start[number], bundles.packet_start[number + 1]):
+        for entry in range(packets.packet_start[number], packets.packet_start[number + 1]):
             j = neighbour[LANES * entry + lane]
             v0, v1, v2 = x[i] - x[j], x[i + 1] - x[j + 1], x[i + 2] - x[j + 2]
             total += 0.5 * weights[kinds[entry] + LANES + lane] * (v0 * v0 + v1 * v1 + v2 * v2)
     return total
 
 
-def newton(bundles, number, x, right, majorant, near):
-    """Vertex block descent: a Newton step of each vertex; springs that are short are not looked for."""
-    own, neighbour, kind, weights = bundles.row_offset, bundles.neighbour_offset, bundles.weight_offset, bundles.weights
+def step_vertices(packets, number, x, right, majorant, near):
+    """Update each vertex of a packet by a Newton step; degenerate springs are not detected."""
+    own, neighbour, kind, weights = packets.row_offset, packets.neighbour_offset, packets.weight_offset, packets.weights
     for lane in range(LANES):
         i, at = own[LANES * number + lane], RHS_STRIDE * number + lane
         fixed = right[at + 3 * LANES]
@@ -59,7 +61,7 @@ def newton(bundles, number, x, right, majorant, near):
         )
         g0, g1, g2 = load0, load1, load2
         a, b, c, d, e, f = fixed, 0.0, 0.0, fixed, 0.0, fixed
-        for entry in range(bundles.packet_start[number], bundles.packet_start[number + 1]):
+        for entry in range(packets.packet_start[number], packets.packet_start[number + 1]):
             j, w = neighbour[LANES * entry + lane], kind[entry] + lane
             v0, v1, v2 = p0 - x[j], p1 - x[j + 1], p2 - x[j + 2]
             pull, k, root = weights[w], weights[w + LANES], 1.0 / np.sqrt(v0 * v0 + v1 * v1 + v2 * v2)
@@ -79,7 +81,7 @@ def newton(bundles, number, x, right, majorant, near):
         s0 = g0 / a - l1 * s1 - l2 * s2
         least = 1e-14 * (a + d + f)
         rise = 0.5 * fixed * (s0 * s0 + s1 * s1 + s2 * s2) - s0 * load0 - s1 * load1 - s2 * load2
-        for entry in range(bundles.packet_start[number], bundles.packet_start[number + 1]):
+        for entry in range(packets.packet_start[number], packets.packet_start[number + 1]):
             j, w = neighbour[LANES * entry + lane], kind[entry] + lane
             v0, v1, v2 = p0 - x[j], p1 - x[j + 1], p2 - x[j + 2]
             m0, m1, m2 = v0 + s0, v1 + s1, v2 + s2
@@ -97,15 +99,15 @@ def newton(bundles, number, x, right, majorant, near):
 
 
 def dot(a, b, count):
-    """a b."""
+    """Return the dot product of a and b."""
     total = 0.0
     for k in range(count):
         total += a[k] * b[k]
     return total
 
 
-def dots(s, w, g, count):
-    """s g and w g."""
+def dot_pair(s, w, g, count):
+    """Return the dot products of s and g, and of w and g."""
     first, second = 0.0, 0.0
     for k in range(count):
         first += s[k] * g[k]
@@ -113,8 +115,8 @@ def dots(s, w, g, count):
     return first, second
 
 
-def gather(values, columns, begin, end, x):
-    """sum over begin <= e < end of values[e] x[columns[e]]."""
+def multiply_sparse_row(values, columns, begin, end, x):
+    """Return the sum of values[e] x[columns[e]] over begin <= e < end."""
     s0 = s1 = s2 = zero = x[0, 0] * 0
     for e in range(begin, end):
         j, value = columns[e], values[e]
@@ -122,8 +124,8 @@ def gather(values, columns, begin, end, x):
     return s0, s1, s2, zero
 
 
-def add_forward(panel, offset, index, at, count, x, x_row, y, y_row, numbers, quads):
-    """y += W x of a panel, row by row."""
+def add_panel_product(panel, offset, index, at, count, x, x_row, y, y_row, numbers, quads):
+    """Add W x of a panel to y, row by row."""
     width, zero = 4 * quads, y[0] * 0
     for tile in range(count // 4):
         for r in range(4):
@@ -141,8 +143,8 @@ def add_forward(panel, offset, index, at, count, x, x_row, y, y_row, numbers, qu
                 y[row + 3] += s3
 
 
-def set_backward(square, start, own, panel, offset, index, at, below, y, x_row, quads):
-    """y = S y + W'y of a panel: S y through the rows' fourth numbers, one axis at a time."""
+def set_transposed_product(square, start, own, panel, offset, index, at, below, y, x_row, quads):
+    """Set y to S y + W'y of a panel; the fourth numbers of the rows store one axis of S y at a time."""
     width, zero = 4 * quads, y[0] * 0
     for c in range(3):
         for j in range(width):
@@ -163,8 +165,8 @@ def set_backward(square, start, own, panel, offset, index, at, below, y, x_row, 
         y[4 * (x_row + j) + 2] += s2
 
 
-def subtract_product(L, at, top, stride, depth, C, to, step, strips, columns):
-    """A tile less the product of all columns to the left."""
+def subtract_tile_product(L, at, top, stride, depth, C, to, step, strips, columns):
+    """Subtract the product of all columns to the left from a tile."""
     for j in range(columns):
         for k in range(depth):
             factor = L[top + j + stride * k]
@@ -172,8 +174,8 @@ def subtract_product(L, at, top, stride, depth, C, to, step, strips, columns):
                 C[to + r + step * j] -= L[at + r + stride * k] * factor
 
 
-def divide(L, at, stride, triangle, strips, columns):
-    """A tile divided by its own triangle."""
+def solve_tile_triangle(L, at, stride, triangle, strips, columns):
+    """Divide a tile by its triangle."""
     for j in range(columns):
         for k in range(j):
             for r in range(at, at + TILE_ROWS * strips):
@@ -182,8 +184,8 @@ def divide(L, at, stride, triangle, strips, columns):
             L[r + stride * j] *= triangle[j, j]
 
 
-def factorise_corner(L, at, stride, least, triangle, columns):
-    """The Cholesky factor of a tile's corner."""
+def factorise_tile(L, at, stride, least, triangle, columns):
+    """Compute the Cholesky factor of a tile's square block; return whether all pivots exceed their bounds."""
     for j in range(columns):
         for i in range(j, columns):
             entry = L[at + stride * j + i]
@@ -198,8 +200,8 @@ def factorise_corner(L, at, stride, least, triangle, columns):
     return True
 
 
-def solve_columns(L, at, stride, x, to, strips, columns):
-    """A tile's pass forwards."""
+def forward_solve_tile(L, at, stride, x, to, strips, columns):
+    """Apply a tile in forward substitution."""
     for j in range(columns):
         for k in range(j):
             x[to + j] -= L[at + stride * k + j] * x[to + k]
@@ -209,8 +211,8 @@ def solve_columns(L, at, stride, x, to, strips, columns):
             x[to + r] -= L[at + stride * j + r] * x[to + j]
 
 
-def solve_rows(L, at, stride, x, to, strips, columns):
-    """A tile's pass backwards."""
+def backward_solve_tile(L, at, stride, x, to, strips, columns):
+    """Apply a tile in backward substitution."""
     for j in range(columns - 1, -1, -1):
         total = x[to + j]
         for r in range(columns, columns + TILE_ROWS * strips):
@@ -220,14 +222,14 @@ def solve_rows(L, at, stride, x, to, strips, columns):
         x[to + j] = total * L[at + stride * j + j]
 
 
-def add(source, at, target, to, count):
-    """target += source."""
+def add_vector(source, at, target, to, count):
+    """Add source to target."""
     for r in range(count):
         target[to + r] += source[at + r]
 
 
-def eight(vertices, x, first, last, edges, limit, tile):
-    """See `springbench.solvers.contact.collisions`."""
+def compute_packet_distances(vertices, x, first, last, edges, limit, tile):
+    """Compute distances of eight candidate pairs (9, 8), and return the mask of those within the limit."""
     left = 0
     for lane in range(8):
         v = vertices[min(first + lane, last)]

@@ -1,10 +1,11 @@
-"""Speedup of vector code compared with plain Numba.
+"""Measure the speedup of vector code compared with plain Numba.
 
     python -m tests.bench.vectors [FILE ...] [--publish results/published/vectors]
 
-A kernel is compiled twice, as it is and with plain functions (`tests.bench.plain`) in the place of the vectors that it
-calls. Both must find the same, and are then timed in turns, A B B A or B A A B by a coin, by this thread's CPU time;
-the interval is the gates' (see README.md). What saves less than 15 % has no place in `solvers/simd`.
+A kernel is compiled twice: as it is, and with plain functions (`tests.bench.plain`) in place of the vector functions
+that it calls. Both must compute the same results. They are then timed interleaved in blocks of random order, A B B A or
+B A A B, by the CPU time of the thread. The ratio is plain over vector code; its interval is computed as for the gates
+(see README.md). Vector code that saves less than 15 % does not belong in `solvers/simd`.
 """
 
 from __future__ import annotations
@@ -47,50 +48,51 @@ from springbench.solvers.methods.vertex_block import vbd_sweeps
 from springbench.solvers.model.step_problem import Positions
 
 from tests.bench import plain
-from tests.bench.gates import STOP, prepare, sheet
+from tests.bench.gates import STOP, build_sheet, prepare_solver
 from tests.bench.pairs import fold_sheet
 from tests.bench.scripted_study import describe_provenance, publish_rows
-from tests.bench.solves import system_matrix
+from tests.bench.solves import build_system_matrix
 
 SIZE, NUM_BLOCKS = 64, 40
 SHEET_FILE = Path(__file__).with_name("gates.py")
-"""File that states the measured sheet."""
+"""File that defines the measured sheet."""
 ROUND_OFF = 1e-5
-"""Of the largest entry: the same sums in another order, in float32 or among pins of 1e10 N/m in float64."""
+"""Accepted difference over the largest entry: sums in another order, in float32 or with pins of 1e10 N/m in float64."""
 
 
 @dataclass(frozen=True)
-class Case:
-    """A kernel with the arguments of a call, and what takes the place of which names in it and in what it calls.
+class KernelCase:
+    """A kernel with the arguments of a call, and the plain functions that replace vector functions.
 
-    found: which of the arguments are outputs, in addition to what it returns; they are set back before a comparison.
+    plain_functions: by the names that they replace in the kernel and in its callees; outputs: indices of arguments that
+    are outputs, in addition to the returned value; they are restored before a comparison.
     """
 
-    what: str
+    name: str
     kernel: Any
     arguments: tuple[Any, ...]
-    plain: dict[str, Callable[..., Any]]
-    found: tuple[int, ...]
+    plain_functions: dict[str, Callable[..., Any]]
+    outputs: tuple[int, ...]
 
 
-def recompile_kernel(kernel: Any, plain: dict[str, Callable[..., Any]]) -> Any:
-    """The kernel, to be called from Python, with what is plain in the place of what has these names."""
+def recompile_kernel(kernel: Any, plain_functions: dict[str, Callable[..., Any]]) -> Any:
+    """Compile a kernel for calls from Python, with plain functions in place of those with these names."""
     function = kernel.py_func
     names: dict[str, Any] = {}
     for name in function.__code__.co_names:
         value = function.__globals__.get(name)
-        if name in plain and value is not None:
-            names[name] = _compile_function(plain[name])
+        if name in plain_functions and value is not None:
+            names[name] = _compile_function(plain_functions[name])
         elif isinstance(value, ModuleType) and value.__name__.startswith("springbench.solvers."):
             names[name] = ModuleType(name)
-            found = {key: part for key, part in plain.items() if hasattr(value, key)}
-            vars(names[name]).update(vars(value) | {key: _compile_function(part) for key, part in found.items()})
+            replaced = {key: part for key, part in plain_functions.items() if hasattr(value, key)}
+            vars(names[name]).update(vars(value) | {key: _compile_function(part) for key, part in replaced.items()})
         elif (
             hasattr(value, "py_func")
             and value.__module__.startswith("springbench.solvers.")
-            and _reaches(value, set(plain))
+            and _calls_any(value, set(plain_functions))
         ):
-            names[name] = recompile_kernel(value, plain)
+            names[name] = recompile_kernel(value, plain_functions)
     copy = FunctionType(function.__code__, function.__globals__ | names, function.__name__, function.__defaults__)
     return _compile_function(copy)
 
@@ -100,20 +102,20 @@ def _compile_function(function: Callable[..., Any]) -> Any:
     return njit(**options)(function)
 
 
-def _reaches(kernel: Any, names: set[str], seen: frozenset[Any] = frozenset()) -> bool:
-    """Whether a kernel calls what has one of these names, or calls one that does."""
+def _calls_any(kernel: Any, names: set[str], seen: frozenset[Any] = frozenset()) -> bool:
+    """Return whether a kernel calls a function with one of these names, directly or through its callees."""
     function = kernel.py_func
     called = [function.__globals__.get(name) for name in function.__code__.co_names]
     inner = [one for one in called if hasattr(one, "py_func") and one not in seen]
     return bool(names & set(function.__code__.co_names)) or any(
-        _reaches(one, names, seen | {kernel}) for one in inner if one is not kernel
+        _calls_any(one, names, seen | {kernel}) for one in inner if one is not kernel
     )
 
 
 def capture_arguments(
     module: Any, name: str, work: Callable[[], object], accepts: Callable[[tuple[Any, ...]], object] = bool
 ) -> tuple[Any, ...]:
-    """The arguments of the last call of a kernel in a module while something is done, of those that are accepted."""
+    """Return the arguments of the last accepted call of a module's kernel during some work."""
     kernel, calls = getattr(module, name), list[tuple[Any, ...]]()
 
     def record_call(*arguments: Any) -> Any:
@@ -129,26 +131,22 @@ def capture_arguments(
     return next(arguments for arguments in reversed(calls) if accepts(arguments))
 
 
-def solving(solver: str) -> Callable[[], object]:
-    """A solver's preparation and first step of the sheet of 64 x 64 vertices."""
-    scene = sheet(SIZE)
-    stated = build_problem(scene, build_initial_state(scene), "previous")
-    return lambda: prepare(solver, scene).solve(stated, STOP)
+def build_solve(solver: str) -> Callable[[], object]:
+    """Return a function that prepares a solver, and solves the first step of the sheet of 64 x 64 vertices."""
+    scene = build_sheet(SIZE)
+    problem = build_problem(scene, build_initial_state(scene), "previous")
+    return lambda: prepare_solver(solver, scene).solve(problem, STOP)
 
 
-def of_springs() -> Iterator[Case]:
-    """Over bundles of eight vertices with their springs."""
-    state, window, _, _ = capture_arguments(accelerated_step, "run_solve", solving("lbfgs"))
-    parts, p, out = state.spring_packets, window.trial_position, window.trial_descent.copy()
-    whole = 0, len(parts.packet_start) - 1
-    short = {"add_spring_projection": plain.refuse, "add_spring_forces": plain.refuse}
-    yield Case(
-        "projections", spring_local_step.add_projection, (parts, *whole, p, state.right_hand_side, out, 0), short, (5,)
-    )
-    yield Case(
-        "gradient", spring_local_step.add_descent, (parts, *whole, p, state.right_hand_side, out, 0), short, (5,)
-    )
-    displacement = np.zeros_like(p)  # longer than the direction: packets read rows of pinned vertices and padding too
+def build_spring_cases() -> Iterator[KernelCase]:
+    """Yield kernels on packets of eight vertices with their springs."""
+    state, window, _, _ = capture_arguments(accelerated_step, "run_solve", build_solve("lbfgs"))
+    packets, p, out = state.spring_packets, window.trial_position, window.trial_descent.copy()
+    arguments = packets, 0, len(packets.packet_start) - 1, p, state.right_hand_side, out, 0
+    rejecting = {"add_spring_projection": plain.reject_packet, "add_spring_forces": plain.reject_packet}
+    yield KernelCase("projections", spring_local_step.add_projection, arguments, rejecting, (5,))
+    yield KernelCase("gradient", spring_local_step.add_descent, arguments, rejecting, (5,))
+    displacement = np.zeros_like(p)  # includes rows of pinned vertices and padding, which packets read
     displacement[: len(window.direction)] = window.direction
     norm = (
         state.norm_packets,
@@ -157,12 +155,13 @@ def of_springs() -> Iterator[Case]:
         displacement,
         state.iteration_plan.norm_diagonal,
     )
-    yield Case("norm of Q", spring_local_step.squared_norm, norm, {"spring_squared_norm": plain.energy}, ())
+    squared_norm = {"spring_squared_norm": plain.compute_squared_norm}
+    yield KernelCase("norm of Q", spring_local_step.squared_norm, norm, squared_norm, ())
 
 
-def of_descent() -> Iterator[Case]:
-    """Over the same bundles, with the objective."""
-    state, window, _, _ = capture_arguments(accelerated_step, "run_solve", solving("lbfgs"))
+def build_descent_cases() -> Iterator[KernelCase]:
+    """Yield the kernel of the objective and its gradient, on packets of eight vertices with their springs."""
+    state, window, _, _ = capture_arguments(accelerated_step, "run_solve", build_solve("lbfgs"))
     descent = (
         state.spring_packets,
         state.objective_weights,
@@ -170,80 +169,75 @@ def of_descent() -> Iterator[Case]:
         state.right_hand_side,
         window.trial_descent.copy(),
     )
-    none = {"spring_energy_and_descent": plain.refuse_energy}
-    yield Case("objective and gradient", spring_objective.value_and_descent, descent, none, (4,))
+    rejecting = {"spring_energy_and_descent": plain.reject_energy}
+    yield KernelCase("objective and gradient", spring_objective.value_and_descent, descent, rejecting, (4,))
 
 
-def of_dots() -> Iterator[Case]:
-    """Over the vectors of L-BFGS."""
-    _, window, _, _ = capture_arguments(accelerated_step, "run_solve", solving("lbfgs"))
-    both = {"ordered_dot": plain.dot, "ordered_dot_pair": plain.dots}
-    yield Case("a step of L-BFGS", accelerated_descent.accept_trial, (window, window.correction.copy()), both, ())
+def build_dot_cases() -> Iterator[KernelCase]:
+    """Yield the kernel of dot products of the vectors of L-BFGS."""
+    _, window, _, _ = capture_arguments(accelerated_step, "run_solve", build_solve("lbfgs"))
+    dots, arguments = {"ordered_dot": plain.dot, "ordered_dot_pair": plain.dot_pair}, (window, window.correction.copy())
+    yield KernelCase("a step of L-BFGS", accelerated_descent.accept_trial, arguments, dots, ())
 
 
-def of_vbd() -> Iterator[Case]:
-    """Over colours."""
-    blocks, spaces, other, right, _, work, p, _ = capture_arguments(vbd_sweeps, "run_iterations", solving("vbd"))
-    yield Case(
-        "sweep",
-        vbd_sweeps._sweep_vertices,
-        (blocks, spaces, other, right, p, work),
-        {"vbd_newton_step": plain.newton},
-        (4,),
-    )
+def build_vbd_cases() -> Iterator[KernelCase]:
+    """Yield the kernel of sweeps over vertices by colour."""
+    blocks, spaces, other, right, _, work, p, _ = capture_arguments(vbd_sweeps, "run_iterations", build_solve("vbd"))
+    arguments, newton_step = (blocks, spaces, other, right, p, work), {"vbd_newton_step": plain.step_vertices}
+    yield KernelCase("sweep", vbd_sweeps._sweep_vertices, arguments, newton_step, (4,))
 
 
-def of_supernodal() -> Iterator[Case]:
-    """Over the panels of Q's factor."""
-    Q, b = system()
-    panel = {"add_panel_product": plain.add_forward, "set_transposed_product": plain.set_backward}
+def build_supernodal_cases() -> Iterator[KernelCase]:
+    """Yield kernels of solves with the supernodal factor of Q, by precision."""
+    Q, b = build_system()
+    panel = {"add_panel_product": plain.add_panel_product, "set_transposed_product": plain.set_transposed_product}
     for precision in ("float64", "float32"):
 
         def solve_system(precision: Any = precision) -> None:
             SupernodalCholesky(Q, precision=precision).solve(b, np.empty_like(b))
 
         solve = capture_arguments(supernodal_cholesky, "solve_from_arrays", solve_system)
-        yield Case(f"solve, {precision}", triangular_solve.solve_from_arrays, solve, panel, (10,))
+        yield KernelCase(f"solve, {precision}", triangular_solve.solve_from_arrays, solve, panel, (10,))
 
 
-def of_block() -> Iterator[Case]:
-    """Over the fronts of a Hessian."""
+def build_block_cases() -> Iterator[KernelCase]:
+    """Yield kernels of the factorisation and the solve on the fronts of a Hessian."""
     tiles = {
-        "subtract_tile_product": plain.subtract_product,
-        "solve_tile_triangle": plain.divide,
-        "factorise_tile": plain.factorise_corner,
-        "forward_solve_tile": plain.solve_columns,
-        "backward_solve_tile": plain.solve_rows,
-        "add_vector": plain.add,
+        "subtract_tile_product": plain.subtract_tile_product,
+        "solve_tile_triangle": plain.solve_tile_triangle,
+        "factorise_tile": plain.factorise_tile,
+        "forward_solve_tile": plain.forward_solve_tile,
+        "backward_solve_tile": plain.backward_solve_tile,
+        "add_vector": plain.add_vector,
     }
-    # The call that factorises.
-    arguments = capture_arguments(block_cholesky, "run_stages", solving("newton"), lambda call: len(call[2]))
+    # Only the call of the factorisation has matrix values.
+    arguments = capture_arguments(block_cholesky, "run_stages", build_solve("newton"), lambda call: len(call[2]))
     fronts, schedule, values, panels, x, *team = arguments
-    yield Case("factorisation", block_multifrontal.run_stages, arguments, tiles, (3,))
+    yield KernelCase("factorisation", block_multifrontal.run_stages, arguments, tiles, (3,))
     solve = fronts, factorisation_schedule.select_solve(schedule), values, panels, x, *team
-    yield Case("solve", block_multifrontal.run_stages, solve, tiles, (4,))
+    yield KernelCase("solve", block_multifrontal.run_stages, solve, tiles, (4,))
 
 
-def of_rows() -> Iterator[Case]:
-    """Over sparse rows, of Q and of the levels above it."""
-    Q, b = system()
-    cg, rows = ConjugateGradients(Q), {"sparse_row_product": plain.gather}
-    for what, name, found in (
+def build_row_cases() -> Iterator[KernelCase]:
+    """Yield kernels on sparse rows of Q, and of the coarser levels of its multigrid hierarchy."""
+    Q, b = build_system()
+    cg, rows = ConjugateGradients(Q), {"sparse_row_product": plain.multiply_sparse_row}
+    for title, name, outputs in (
         ("product with Q", "multiply_sparse_and_dot", (4,)),
         ("smoothing, float32", "chebyshev_step", (7, 9)),
     ):
         arguments = capture_arguments(multigrid_kernels, name, lambda: cg.solve(b, np.empty_like(b)))
-        yield Case(what, getattr(multigrid_kernels, name), arguments, rows, found)
+        yield KernelCase(title, getattr(multigrid_kernels, name), arguments, rows, outputs)
 
 
-def system() -> tuple[csr_array, Positions]:
-    """Q of the sheet, and a right-hand side."""
-    scene = sheet(SIZE)
-    return system_matrix(scene), np.random.default_rng(0).uniform(-1.0, 1.0, (scene.system.num_vertices, 3))
+def build_system() -> tuple[csr_array, Positions]:
+    """Return the matrix Q of the sheet, and a right-hand side (n, 3)."""
+    scene = build_sheet(SIZE)
+    return build_system_matrix(scene), np.random.default_rng(0).uniform(-1.0, 1.0, (scene.system.num_vertices, 3))
 
 
-def of_eights() -> Iterator[Case]:
-    """Over pairs of four layers that touch."""
+def build_distance_cases() -> Iterator[KernelCase]:
+    """Yield the kernel of distances of candidate pairs, of four layers that touch."""
     made = fold_sheet(SIZE)
     mesh, p = made.mesh, made.p
     surface = CollisionMesh.from_rest_shape(
@@ -255,56 +249,55 @@ def of_eights() -> Iterator[Case]:
         made.dhat,
     )
     pairs = surface.find_proximity_candidates(p, 1.5 * (made.min_distance + made.dhat))
-    space = collisions.allocate_collisions(len(pairs.vertices), made.min_distance, made.dhat)
+    storage = collisions.allocate_collisions(len(pairs.vertices), made.min_distance, made.dhat)
     slots = np.empty(1 << (2 * len(pairs.vertices)).bit_length(), np.int32)
-    arguments = pairs, collisions.pad_positions(p), np.empty((9, 8)), slots, space
-    yield Case(
-        "closest points of pairs",
-        collisions.gather_collisions,
-        arguments,
-        {"compute_packet_distances": plain.eight},
-        (2, 3),
-    )
+    arguments = pairs, collisions.pad_positions(p), np.empty((9, 8)), slots, storage
+    distances = {"compute_packet_distances": plain.compute_packet_distances}
+    yield KernelCase("closest points of pairs", collisions.gather_collisions, arguments, distances, (2, 3))
 
 
 CASES = {
-    "spring_forces": of_springs,
-    "spring_descent": of_descent,
-    "dot_products": of_dots,
-    "vbd_packets": of_vbd,
-    "panel_products": of_supernodal,
-    "front_tiles": of_block,
-    "sparse_rows": of_rows,
-    "float64x8": of_eights,
+    "spring_forces": build_spring_cases,
+    "spring_descent": build_descent_cases,
+    "dot_products": build_dot_cases,
+    "vbd_packets": build_vbd_cases,
+    "panel_products": build_supernodal_cases,
+    "front_tiles": build_block_cases,
+    "sparse_rows": build_row_cases,
+    "float64x8": build_distance_cases,
 }
-"""By the file of `solvers/simd`."""
+"""Functions that yield the kernels of each file of vector code, by the name of the file."""
 
 
-def ratio(case: Case) -> tuple[float, float, float]:
-    """Plain over vectors: the median, and the interval around it. Raises AssertionError where they find otherwise."""
-    assert _reaches(case.kernel, set(case.plain)), f"{case.what}: calls none of {sorted(case.plain)}"
-    kernels = [recompile_kernel(case.kernel, names) for names in (case.plain, {})]
-    saved, answers = [np.copy(case.arguments[k]) for k in case.found], []
+def measure_ratio(case: KernelCase) -> tuple[float, float, float]:
+    """Return the median time ratio of plain to vector code, and its interval.
+
+    Raises AssertionError if the results differ.
+    """
+    replaced = sorted(case.plain_functions)
+    assert _calls_any(case.kernel, set(replaced)), f"{case.name}: calls none of {replaced}"
+    kernels = [recompile_kernel(case.kernel, functions) for functions in (case.plain_functions, {})]
+    saved, results = [np.copy(case.arguments[k]) for k in case.outputs], []
     for kernel in kernels:
-        for k, before in zip(case.found, saved, strict=True):
+        for k, before in zip(case.outputs, saved, strict=True):
             case.arguments[k][...] = before
         returned = kernel(*case.arguments)
-        answers.append([np.copy(case.arguments[k]) for k in case.found] + [returned] * isinstance(returned, float))
-    for one, other in zip(*answers, strict=True):
-        assert np.abs(one - other).max() <= ROUND_OFF * np.abs(other).max(), f"{case.what}: others"
-    once = min(_seconds(kernel, case, 3) for kernel in kernels)
+        results.append([np.copy(case.arguments[k]) for k in case.outputs] + [returned] * isinstance(returned, float))
+    for one, other in zip(*results, strict=True):
+        assert np.abs(one - other).max() <= ROUND_OFF * np.abs(other).max(), f"{case.name}: results differ"
+    once = min(_measure_seconds(kernel, case, 3) for kernel in kernels)
     repeats = max(1, ceil(MIN_CALL_SECONDS / once / 2))
-    turns = []
+    log_ratios = []
     for order in islice(draw_block_orders(), NUM_BLOCKS):
-        seconds = tuple(_seconds(kernels["AB".index(who)], case, repeats) for who in order)
-        turns.append(TimedBlock(order, seconds).log_ratio)
-    found = compute_interval(turns)
-    return found.ratio, found.low, found.high
+        seconds = tuple(_measure_seconds(kernels["AB".index(program)], case, repeats) for program in order)
+        log_ratios.append(TimedBlock(order, seconds).log_ratio)
+    interval = compute_interval(log_ratios)
+    return interval.ratio, interval.low, interval.high
 
 
-def _seconds(kernel: Any, case: Case, repeats: int) -> float:
-    """How long a call takes."""
-    for k in case.found:
+def _measure_seconds(kernel: Any, case: KernelCase, repeats: int) -> float:
+    """Return the mean CPU time [s] of a call."""
+    for k in case.outputs:
         case.arguments[k][...] = case.arguments[k]
     began = thread_time()
     for _ in range(repeats):
@@ -313,7 +306,7 @@ def _seconds(kernel: Any, case: Case, repeats: int) -> float:
 
 
 def main() -> None:
-    """Measure the files that are named, or all, and print a table."""
+    """Measure the files of the command line, or all, and print a table."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("files", nargs="*", default=list(CASES), metavar="FILE")
     parser.add_argument("--publish", type=Path, help="folder of a published study")
@@ -324,10 +317,10 @@ def main() -> None:
     with limit_threads(1):
         for file in options.files:
             for case in CASES[file]():
-                median, low, high = ratio(case)
-                print(f"| `{file}` | {case.what} | {median:.2f} times as long | {low:.2f} and {high:.2f} |", flush=True)
+                median, low, high = measure_ratio(case)
+                print(f"| `{file}` | {case.name} | {median:.2f} times as long | {low:.2f} and {high:.2f} |", flush=True)
                 rows.append(
-                    {"file": file, "kernel": case.what, "size": SIZE, "ratio": median, "low": low, "high": high}
+                    {"file": file, "kernel": case.name, "size": SIZE, "ratio": median, "low": low, "high": high}
                 )
     command = " ".join(["python -m tests.bench.vectors", *(options.files if options.files != list(CASES) else ())])
     publish_rows(options.publish, SHEET_FILE, command, rows, begin)
