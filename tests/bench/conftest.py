@@ -1,6 +1,7 @@
-"""`pytest tests/bench --benchmark-only` runs the short gates, prints their ratios and stores their times.
+"""Configure timed sessions: `pytest tests/bench --benchmark-only` runs the short gates, and prints their ratios.
 
-They are stored under results/bench. `--all-gates` runs all gates, `-k accuracy` those of accuracy alone."""
+The times are stored under results/bench. `--all-gates` runs all gates, `-k accuracy` those on accuracy alone.
+"""
 
 import os
 from time import monotonic
@@ -14,7 +15,7 @@ from threadpoolctl import threadpool_info
 from tests.bench.gates import THREADS
 
 SHORT_BUDGET = 30.0
-"""Seconds that a gate of the short set may take: six of them, with their scenes, take four minutes."""
+"""Time limit of a gate of the short set [s]: six of them, with their scenes, take four minutes."""
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -22,14 +23,14 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def is_short_set(config: pytest.Config) -> bool:
-    """Whether a timed session names no gates, so that the short ones are run."""
-    given = config.invocation_params.args
-    named = any(str(word).startswith(("-k", "-m", "--last-failed")) or "::" in str(word) for word in given)
-    return config.option.benchmark_only and not named
+    """Return whether a timed session selects no gates by name, so that it runs the short ones."""
+    arguments = config.invocation_params.args
+    is_selective = any(str(one).startswith(("-k", "-m", "--last-failed")) or "::" in str(one) for one in arguments)
+    return config.option.benchmark_only and not is_selective
 
 
 class RemainingTime:
-    """Prints after each gate how many there are, and about how long they will take."""
+    """Prints after each gate the number of completed ones, and the estimated remaining time."""
 
     def __init__(self, config: pytest.Config, count: int, budget: float) -> None:
         self.reporter: Any = config.pluginmanager.get_plugin("terminalreporter")
@@ -63,7 +64,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
-    """The gates that were measured, as a table."""
+    """Print a table of the measured gates."""
     session: Any = getattr(config, "_benchmarksession", None)
     measured = [one for one in session.benchmarks if "max_ratio" in one.extra_info] if session else []
     for one in measured:
@@ -85,8 +86,8 @@ def pytest_collection_finish(session: pytest.Session) -> None:
 
 
 def pytest_benchmark_update_machine_info(machine_info: dict[str, Any]) -> None:
-    # What is stored may be published: it names the machine's kind and not its owner, and contains
-    # nothing that changes from one run to the next, so that two files compare.
+    # Stored results may be published. They describe the type of the machine without its name, and contain nothing that
+    # changes from one run to the next, so that two files are comparable.
     del machine_info["node"]
     machine_info["cpu"] = {key: machine_info["cpu"].get(key) for key in ("brand_raw", "arch", "count")}
     machine_info["affinity"] = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
@@ -100,8 +101,8 @@ def pytest_benchmark_update_machine_info(machine_info: dict[str, Any]) -> None:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Without timing, gates of accuracy are deselected: their solves take seconds, and nothing is compared."""
+    """Deselect gates on accuracy in sessions without timing: their solves take seconds, and nothing is compared."""
     if config.option.benchmark_disable and not config.option.benchmark_enable:
-        idle = [item for item in items if item.name.startswith("test_the_gate_passes[accuracy-")]
-        config.hook.pytest_deselected(items=idle)
-        items[:] = [item for item in items if item not in idle]
+        accuracy_gates = [item for item in items if item.name.startswith("test_the_gate_passes[accuracy-")]
+        config.hook.pytest_deselected(items=accuracy_gates)
+        items[:] = [item for item in items if item not in accuracy_gates]

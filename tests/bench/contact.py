@@ -1,4 +1,4 @@
-"""A gate on contact while nothing is near: whole steps with an obstacle far away, and without one."""
+"""Define the gate on idle contact: steps with distant obstacles compared with steps without contact."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from springbench.harness.scenes.scene_builder import build_scene
 from springbench.harness.scenes.scene_spec import SceneSpec
 from springbench.harness.simulation.time_loop import simulate_scene
 
-from tests.bench.gates import STOP, Gate, Work, last, prepare
+from tests.bench.gates import STOP, Gate, Work, get_last_positions, prepare_solver
 
 FAR = ContactEffect.model_validate(
     {
@@ -24,12 +24,14 @@ FAR = ContactEffect.model_validate(
 
 
 def build_fall(*effects: ContactEffect, size: int, frames: int) -> Work:
-    """Whole steps of the compiled backend; the last positions [m]."""
-    given = SpringsEffect(stretch=1000.0), GravityEffect(), PinsEffect(parts=("top_corners",)), *effects
-    spec = SceneSpec(mesh=GridMesh(), mass=1.0, time_step=1 / 30, frames=1, effects=given, path=Path("sheet.yaml"))
+    """Build work that computes steps of a sheet by the compiled backend, and returns the last positions (n, 3) [m]."""
+    all_effects = SpringsEffect(stretch=1000.0), GravityEffect(), PinsEffect(parts=("top_corners",)), *effects
+    spec = SceneSpec(
+        mesh=GridMesh(), mass=1.0, time_step=1 / 30, frames=1, effects=all_effects, path=Path("sheet.yaml")
+    )
     scene = build_scene(spec, size)
-    prepared = prepare("numba", scene)
-    return lambda: last(
+    prepared = prepare_solver("numba", scene)
+    return lambda: get_last_positions(
         step.solution for step in simulate_scene(scene, prepared, STOP, initial_guess="previous", frames=frames)
     )
 
@@ -41,8 +43,8 @@ CONTACT = (
         baseline=lambda: build_fall(size=64, frames=10),
         limit=1.05,
         goal=1.02,
-        why="a promise: obstacles that are far away cost one test of a box, at most 2 % of a step; measured 1.01 to "
-        "1.02 on an idle core, and medians of 1.01 under load; room for what differs from start to start",
+        why="a target: distant obstacles require one test of a bounding box, at most 2 % of a step; measured 1.01 to "
+        "1.02 on an idle core, and medians of 1.01 under load; the rest is a margin for variation between processes",
         guards=("test_idle_contact_allocates_no_array_more",),
         short=True,
     ),

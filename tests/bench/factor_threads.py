@@ -30,7 +30,7 @@ from springbench.harness.simulation.time_loop import build_initial_state, build_
 from springbench.solvers.objective.fixed_objective import FixedObjective
 from springbench.solvers.objective.step_objective import StepObjective
 
-from tests.bench.gates import sheet
+from tests.bench.gates import build_sheet
 from tests.bench.scripted_study import describe_provenance, publish_rows
 
 SCENE = Path(__file__).parents[2] / "configs" / "scenes" / "hanging-cloth.yaml"
@@ -41,7 +41,7 @@ PAUSE = 0.3
 
 def build_newton_iteration(size: int) -> tuple[Callable[[], object], StepObjective, np.ndarray]:
     """Return an iteration on the sheet, its objective, and the positions (n, 3) [m] at which it begins."""
-    scene = sheet(size)
+    scene = build_sheet(size)
     step = StepObjective(FixedObjective(scene.system), build_problem(scene, build_initial_state(scene), "previous"))
     p = step.apply_exact_pins(1.05 * scene.mesh.rest_positions)
 

@@ -1,8 +1,10 @@
-"""The gates: what must stay how fast against what. A new gate is one entry of `GATES`.
+"""Define the gates, which compare the time of a candidate with that of a baseline; a new gate is one entry of `GATES`.
 
-All work runs with one thread of Numba and one of BLAS, so that CPU times of the process are its durations, and
-another program on the machine hardly moves them. Recordings are written by a thread of their own next to the solver's:
-what counts there is how long one waits, the wall time.
+    pytest tests/bench --benchmark-only
+
+All work runs with one thread of Numba and one of BLAS, so that CPU time measures its duration and other programs on the
+machine have little effect. Recordings are written by a separate thread, next to that of the solver: wall time measures
+their duration.
 """
 
 from __future__ import annotations
@@ -39,15 +41,14 @@ Work = Callable[[], Positions]
 
 @dataclass(frozen=True, slots=True)
 class Gate:
-    """Two makers of work that must come to the same positions, and how their times may compare.
+    """Two builders of work that computes the same positions, and the limit of the ratio of their times.
 
-    limit: of time of the candidate / time of the baseline, which must hold on every machine; what becomes slower
-    below it `springbench regress --baseline` finds; why: where the limit comes from; guards: the exact gates, tests of
-    `test_exact.py`, that see on any machine what would make the candidate slow; clock: what time is, cpu or wall;
-    goal: what the ratio is to become where it is not yet: the limit then preserves what has been reached; tolerance:
-    the largest difference of the two answers, in their size, None where each maker makes sure of its own; budget:
-    seconds until the gate is undecided, --paired-benchmark-budget where it has none; error: the probability of a wrong
-    answer; short: whether every run of the CI takes it.
+    limit: largest ratio of the candidate's time to the baseline's on every machine; `springbench regress --baseline`
+    detects smaller slowdowns; why: reason of the limit; guards: exact gates, tests of `test_exact.py`, that detect on
+    any machine what would slow down the candidate; clock: cpu or wall; goal: target of the ratio where it is not
+    reached: the limit then preserves the present ratio; tolerance: largest relative difference of the two results, None
+    if each builder checks its own; budget: seconds until the verdict is inconclusive, --paired-benchmark-budget if
+    None; error: probability of a wrong verdict; short: whether it belongs to the short set, which the CI runs.
     """
 
     name: str
@@ -64,76 +65,76 @@ class Gate:
     short: bool = False
 
 
-def sheet(size: int) -> Scene:
-    """A cloth with sides and both diagonals, lying flat, that falls about two pinned corners."""
+def build_sheet(size: int) -> Scene:
+    """Build a flat cloth of springs along sides and both diagonals, which swings down from two pinned corners."""
     effects = (SpringsEffect(stretch=1000.0), GravityEffect(), PinsEffect(parts=("top_corners",)))
     spec = SceneSpec(mesh=GridMesh(), mass=1.0, time_step=1 / 30, frames=1, effects=effects, path=Path("sheet.yaml"))
     return build_scene(spec, size)
 
 
-def prepare(solver: str, scene: Scene, **parameters: str) -> PreparedLocalGlobal:
-    """A solver by name, prepared for the scene."""
+def prepare_solver(solver: str, scene: Scene, **parameters: str) -> PreparedLocalGlobal:
+    """Prepare a solver by name for a scene."""
     return load_target(SOLVERS[solver])(**parameters).prepare(scene.system)
 
 
-def steps(scene: Scene, prepared: PreparedSolver, frames: int) -> list[SimulationStep]:
-    """The scene's first steps."""
+def simulate_steps(scene: Scene, prepared: PreparedSolver, frames: int) -> list[SimulationStep]:
+    """Simulate the first steps of a scene."""
     return list(simulate_scene(scene, prepared, STOP, initial_guess="previous", frames=frames))
 
 
 def build_simulation(solver: str, size: int, frames: int) -> Work:
-    """Whole steps through the harness; the last positions [m]."""
-    scene = sheet(size)
-    prepared = prepare(solver, scene)
-    return lambda: last(
+    """Build work that computes steps through the harness, and returns the last positions (n, 3) [m]."""
+    scene = build_sheet(size)
+    prepared = prepare_solver(solver, scene)
+    return lambda: get_last_positions(
         step.solution for step in simulate_scene(scene, prepared, STOP, initial_guess="previous", frames=frames)
     )
 
 
 def build_solve(solver: str, size: int, frames: int) -> Work:
-    """The solver alone, on the problems that the harness states in the same steps; the last positions [m]."""
-    scene = sheet(size)
-    prepared = prepare(solver, scene)
-    problems = [step.problem for step in steps(scene, prepared, frames)]
-    return lambda: last(prepared.solve(problem, STOP) for problem in problems)
+    """Build work that solves the problems of the same steps without the harness; last positions (n, 3) [m]."""
+    scene = build_sheet(size)
+    prepared = prepare_solver(solver, scene)
+    problems = [step.problem for step in simulate_steps(scene, prepared, frames)]
+    return lambda: get_last_positions(prepared.solve(problem, STOP) for problem in problems)
 
 
-def last(solutions: Iterable[Solution]) -> Positions:
-    """The last solution's positions; the others are let go at once, for new pages of memory take time too."""
+def get_last_positions(solutions: Iterable[Solution]) -> Positions:
+    """Return the positions of the last solution; the others are freed at once, since new memory pages take time."""
     (solution,) = deque(solutions, maxlen=1)
     return solution.positions
 
 
 def build_projection(solver: str, size: int, repeats: int, **parameters: str) -> Work:
-    """The local step alone, at stretched positions; A'K d [N]."""
-    scene = sheet(size)
-    prepared = prepare(solver, scene, **parameters)
+    """Build work that computes the local step alone, at stretched positions, and returns A'K d (n, 3) [N]."""
+    scene = build_sheet(size)
+    prepared = prepare_solver(solver, scene, **parameters)
     p = 1.1 * scene.mesh.rest_positions
-    nothing, out = np.zeros_like(p), np.empty_like(p)
+    zero_load, out = np.zeros_like(p), np.empty_like(p)
 
     def work() -> Positions:
         for _ in range(repeats):
-            prepared.local_step(p, nothing, out)
+            prepared.local_step(p, zero_load, out)
         return out
 
     return work
 
 
 def build_recording(solver: str, size: int, frames: int) -> Work:
-    """Whole steps, each recorded, to a finished recording; the last positions [m]."""
-    scene = sheet(size)
-    prepared = prepare(solver, scene)
+    """Build work that computes steps and writes a recording of them, and returns the last positions (n, 3) [m]."""
+    scene = build_sheet(size)
+    prepared = prepare_solver(solver, scene)
 
     folder, numbers = TemporaryDirectory(), count()
 
-    def work() -> Positions:  # to a file of its own: to remove one takes time too, and goes as long as the work
-        return record(scene, prepared, frames, Path(folder.name) / f"{next(numbers)}.rrd")
+    def work() -> Positions:  # each call writes a new file, since to delete one takes time as well
+        return record_steps(scene, prepared, frames, Path(folder.name) / f"{next(numbers)}.rrd")
 
     return work
 
 
-def record(scene: Scene, prepared: PreparedSolver, frames: int, path: Path) -> Positions:
-    """The second pass of a run over the scene's first steps; the last positions [m]."""
+def record_steps(scene: Scene, prepared: PreparedSolver, frames: int, path: Path) -> Positions:
+    """Run the instrumentation pass over the first steps of a scene, and return the last positions (n, 3) [m]."""
     info = RecordingInfo(
         title="sheet",
         run_id="sheet",
@@ -154,7 +155,7 @@ def record(scene: Scene, prepared: PreparedSolver, frames: int, path: Path) -> P
     return stored[-1]
 
 
-# Tolerances: the backends add the same numbers in another order.
+# The tolerances allow for sums in a different order by the backends.
 GATES = (
     Gate(
         short=True,
@@ -164,7 +165,7 @@ GATES = (
         tolerance=1e-9,
         limit=0.3,
         guards=("test_matrices_have_as_many_entries_as_stored", "test_a_tolerance_takes_as_many_iterations_as_stored"),
-        why="measured 0.09; its parts, the local step and the solve, take up to 0.26 on other processors",
+        why="measured 0.09; its parts, the local step and the solve, have ratios of up to 0.26 on other processors",
     ),
     Gate(
         name="sparse-against-dense-24",
@@ -173,19 +174,19 @@ GATES = (
         tolerance=1e-9,
         limit=0.1,
         guards=("test_matrices_have_as_many_entries_as_stored", "test_a_tolerance_takes_as_many_iterations_as_stored"),
-        why="measured 0.066 since the dense product takes half as long; half as much again for faster BLAS",
+        why="measured 0.066 with the present dense product; half of that is a margin for a faster BLAS",
     ),
     Gate(
         short=True,
         name="compiled-local-step-against-numpy-64",
         candidate=lambda: build_projection(
             "numba", 64, repeats=50, linear_solver="cholespy"
-        ),  # whose local step can be called
+        ),  # with this linear solver the local step is callable
         baseline=lambda: build_projection("sparse", 64, repeats=50),
         tolerance=1e-9,
         limit=0.2,
         guards=("test_a_step_allocates_as_many_arrays_as_stored",),
-        why="measured 0.12 with vectors of 512 bits; two thirds as much again without",
+        why="measured 0.12 with vectors of 512 bits; two thirds of that is a margin for processors without",
     ),
     Gate(
         short=True,
@@ -195,8 +196,8 @@ GATES = (
         limit=1.1,
         goal=1.02,
         guards=("test_a_step_allocates_as_many_arrays_as_stored",),
-        why="a promise: stating the problem of a step costs at most 2 % of solving it; measured 1.008 once, and 1.03 "
-        "to 1.04 since integrators may have several unknowns",
+        why="a target: to build the problem of a step takes at most 2 % of the time to solve it; measured 1.03 to 1.04 "
+        "with support for integrators of several stages, 1.008 without",
     ),
     Gate(
         name="recording-against-simulating-alone-64",
@@ -205,8 +206,8 @@ GATES = (
         limit=1.25,
         goal=1.10,
         guards=("test_a_recording_takes_at_most_20_bytes_a_vertex_and_frame",),
-        why="a pass that records was to take at most 10 % more than one that simulates, and did with steps of 4 ms; "
-        "today they take 2.9, and to open and close a file takes as long as five; measured 1.17",
+        why="a target: a pass that records takes at most 10 % longer than one that simulates; measured 1.17 with steps "
+        "of 2.9 ms, where opening and closing the file takes the time of five steps",
         clock="wall",
     ),
 )

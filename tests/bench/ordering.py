@@ -35,9 +35,9 @@ from springbench.solvers.linalg.cholesky.supernodal_cholesky import SupernodalCh
 from springbench.solvers.linalg.cholesky.symbolic_factorisation import SymbolicFactor, analyse_with_order
 from springbench.solvers.linalg.direct_solvers import SimplicialCholesky
 
-from tests.bench.gates import sheet
+from tests.bench.gates import build_sheet
 from tests.bench.scripted_study import describe_provenance, publish_rows
-from tests.bench.solves import system_matrix
+from tests.bench.solves import build_system_matrix
 from tests.network_matrices import grid_matrix
 
 SCENE = Path(__file__).parents[2] / "configs" / "scenes" / "hanging-cloth.yaml"
@@ -118,7 +118,7 @@ def main() -> None:
     given = parser.parse_args()
     begin, rows = describe_provenance(), list[dict[str, Any]]()
     print(f"{describe_machine().cpu}; load {getloadavg()[0]:.1f}; times in ms")
-    matrices = {f"sheet {n}": system_matrix(sheet(n)) for n in given.sizes}
+    matrices = {f"sheet {n}": build_system_matrix(build_sheet(n)) for n in given.sizes}
     matrices |= {f"solid {n}": grid_matrix(n, n, n) for n in given.solids}
     orders = Table("matrix", "order", "fill", "flops", *("factor, 1", "2", "solve, 1", "2"), box=SIMPLE_HEAD)
     parts = Table("matrix", "ordering", "symbolic", "factor", "all", "CHOLMOD", box=SIMPLE_HEAD)

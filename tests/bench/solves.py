@@ -1,4 +1,4 @@
-"""Gates on the prefactored solve, three right-hand sides at a time, and on whole steps by linear solver."""
+"""Define gates on the prefactored solve with three right-hand sides, and on steps by linear solver."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from springbench.solvers.methods.local_global.compiled_local_global import Compi
 from springbench.solvers.model import system_matrix_assembly
 from springbench.solvers.model.step_problem import Positions
 
-from tests.bench.gates import STOP, Gate, Work, sheet
+from tests.bench.gates import STOP, Gate, Work, build_sheet
 
 GUARDS = ("test_a_supernodal_factor_is_as_large_as_stored",)
 
 
-def system_matrix(scene: Scene) -> csr_array:
-    """Q of a scene of springs."""
+def build_system_matrix(scene: Scene) -> csr_array:
+    """Build the system matrix Q of a scene of springs."""
     return system_matrix_assembly.assemble_system_matrix(scene.system, [scene.all_springs])
 
 
-def solves(factorise: Callable[[csr_array], LinearSolver], size: int, repeats: int) -> Work:
-    """The solve alone, of the sheet's Q and a known answer of size one; what was found."""
-    scene = sheet(size)
-    Q = system_matrix(scene)
+def build_solves(factorise: Callable[[csr_array], LinearSolver], size: int, repeats: int) -> Work:
+    """Build work that solves systems of the sheet's Q with a solution of entries up to 1, and returns that (n, 3)."""
+    scene = build_sheet(size)
+    Q = build_system_matrix(scene)
     factor = factorise(Q)
     b = np.ascontiguousarray(Q @ np.random.default_rng(size).uniform(-1.0, 1.0, (scene.system.num_vertices, 3)))
     out = np.empty_like(b)
@@ -42,20 +42,25 @@ def solves(factorise: Callable[[csr_array], LinearSolver], size: int, repeats: i
 
 
 def build_steps(linear: LinearSolverName, size: int, repeats: int) -> Work:
-    """Whole steps of the compiled backend with a linear solver, from the sheet at rest; the positions [m]."""
-    scene = sheet(size)
+    """Build work that solves the first step of the sheet repeatedly by local-global with a linear solver.
+
+    It returns the positions (n, 3) [m].
+    """
+    scene = build_sheet(size)
     prepared = CompiledLocalGlobal(linear_solver=linear).prepare(scene.system)
-    stated = build_problem(scene, build_initial_state(scene), "previous")
-    return lambda: [prepared.solve(stated, STOP) for _ in range(repeats)][-1].positions
+    problem = build_problem(scene, build_initial_state(scene), "previous")
+    return lambda: [prepared.solve(problem, STOP) for _ in range(repeats)][-1].positions
 
 
-def _gate(against: str, factorise: Callable[[csr_array], LinearSolver], size: int, limit: float, why: str) -> Gate:
+def _build_solve_gate(
+    baseline: str, factorise: Callable[[csr_array], LinearSolver], size: int, limit: float, why: str
+) -> Gate:
     repeats = max(4, 50 * 64**2 // size**2)
     return Gate(
-        name=f"supernodal-solve-against-{against}-{size}",
-        candidate=lambda: solves(SupernodalCholesky, size, repeats),
-        baseline=lambda: solves(factorise, size, repeats),
-        tolerance=1e-9,  # two factorisations, with pin weights of 1e10 among stiffnesses of 1e3
+        name=f"supernodal-solve-against-{baseline}-{size}",
+        candidate=lambda: build_solves(SupernodalCholesky, size, repeats),
+        baseline=lambda: build_solves(factorise, size, repeats),
+        tolerance=1e-9,  # two factorisations of a matrix with pin weights of 1e10 and stiffnesses of 1e3
         limit=limit,
         guards=GUARDS,
         short=size == 64,
@@ -63,15 +68,15 @@ def _gate(against: str, factorise: Callable[[csr_array], LinearSolver], size: in
     )
 
 
-def _step_gate(size: int) -> Gate:
+def _build_step_gate(size: int) -> Gate:
     return Gate(
         name=f"supernodal-step-against-cholespy-{size}",
         candidate=lambda: build_steps("supernodal", size, max(1, 64**2 // size**2)),
         baseline=lambda: build_steps("cholespy", size, max(1, 64**2 // size**2)),
-        tolerance=1e-9,  # as above, in positions of a metre
+        tolerance=1e-9,  # relative to positions of 1 m
         limit=0.8,
         guards=GUARDS,
-        why="measured 0.39 to 0.46 with vectors of 512 bits; half as much again without; other processors differ",
+        why="measured 0.39 to 0.46 with vectors of 512 bits, half as much again without; the rest is a margin",
     )
 
 
@@ -79,7 +84,7 @@ _CHOLESPY = "faster on every machine; measured 0.36 to 0.44 with vectors of 512 
 _SUPERLU = "twice as fast on every machine; measured 0.11 to 0.15 with vectors of 512 bits here, and 0.26 on a Xeon"
 
 SOLVES = (
-    *(_gate("cholespy", SimplicialCholesky, size, 0.9, _CHOLESPY) for size in (32, 64, 128)),
-    *(_gate("splu", SparseLU, size, 0.5, _SUPERLU) for size in (32, 64, 128)),
-    *(_step_gate(size) for size in (32, 64, 128)),
+    *(_build_solve_gate("cholespy", SimplicialCholesky, size, 0.9, _CHOLESPY) for size in (32, 64, 128)),
+    *(_build_solve_gate("splu", SparseLU, size, 0.5, _SUPERLU) for size in (32, 64, 128)),
+    *(_build_step_gate(size) for size in (32, 64, 128)),
 )

@@ -1,4 +1,4 @@
-"""Gates on what effects cost: an iteration with each effect over one without, by each solver that has a goal."""
+"""Gates on the overhead of effects: the time of an iteration with an effect over one without, by solver."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from tests.bench.effects import DEFAULT_SOLVERS, GATES, KINDS, PRICES, SINGLE_EF
 @pytest.mark.parametrize("effect", [*SINGLE_EFFECTS, "all"])
 @pytest.mark.parametrize("solver", DEFAULT_SOLVERS)
 def test_an_effect_stays_below_its_limit(solver: str, effect: str):
-    """By the lower end of the interval: a price that is beyond the limit for sure fails, noise does not."""
+    """The lower end of the interval is compared, so that noise does not cause a failure."""
     made, scene = load_target(SOLVERS[solver])(), load_scene(PRICES)
     with limit_threads(1):
         both = prepare_scene(scene, 33, made, effect), prepare_scene(scene, 33, made)
         found = measure_overhead(effect, *both, STOP, initial_guess="previous", frames=3, max_rounds=5)
     assert found.ratio_interval.low <= GATES[solver][KINDS[effect]]
-    assert found.ratio_interval.estimate >= 1.0 / 3.0  # a result that is so much smaller has not done the work
+    assert found.ratio_interval.estimate >= 1.0 / 3.0  # a much smaller ratio means that work is missing

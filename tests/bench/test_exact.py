@@ -1,7 +1,7 @@
-"""Gates on counts, which no noise can move: entries of matrices, iterations, flops, bytes, allocations, instructions.
-They run in every test run, and each timed gate names those that guard it.
+"""Exact gates on deterministic counts: entries of matrices, iterations, flops, bytes, allocations and instructions.
 
-A number that changes with a new library or a better method is stored again here, in the commit that changes it.
+They belong to every test run, and each timed gate names those that guard it. If a new library or a better method
+changes a number, the commit that changes it stores the new one here.
 """
 
 import gc
@@ -22,8 +22,8 @@ from springbench.solvers.model.step_problem import StopRule
 from springbench.solvers.registry import SOLVERS, load_target
 
 from tests.bench.contact import FAR, build_fall
-from tests.bench.gates import STOP, THREADS, build_simulation, prepare, record, sheet, steps
-from tests.bench.solves import system_matrix
+from tests.bench.gates import STOP, THREADS, build_sheet, build_simulation, prepare_solver, record_steps, simulate_steps
+from tests.bench.solves import build_system_matrix
 from tests.scene_builders import SCENE_BUILDERS
 
 
@@ -38,62 +38,62 @@ from tests.scene_builders import SCENE_BUILDERS
     ],
 )
 def test_matrices_have_as_many_entries_as_stored(solver: str, size: int, system: int, factor: int):
-    scene = sheet(size)
-    facts = prepare(solver, scene).stats
-    # Q has an entry for each vertex and two for each spring; the factor's number is that of the ordering.
+    scene = build_sheet(size)
+    stats = prepare_solver(solver, scene).stats
+    # Q has an entry for each vertex and two for each spring; the number of the factor depends on the ordering.
     assert system == len(scene.mesh.rest_positions) + 2 * len(scene.mesh.springs)
-    assert (facts["nnz_system"], facts["nnz_factor"]) == (system, factor)
+    assert (stats["nnz_system"], stats["nnz_factor"]) == (system, factor)
 
 
 @pytest.mark.parametrize(
     ("scene", "nonzeros", "factor_bytes", "flops"),
     [
-        (sheet(32), 19_161, 303_104, 367_392),
-        (sheet(64), 103_273, 1_426_432, 1_802_400),
-        (sheet(128), 527_787, 6_629_888, 8_609_952),
+        (build_sheet(32), 19_161, 303_104, 367_392),
+        (build_sheet(64), 103_273, 1_426_432, 1_802_400),
+        (build_sheet(128), 527_787, 6_629_888, 8_609_952),
         (SCENE_BUILDERS["block"](1e10), 6_157, 73_728, 94_752),
         (SCENE_BUILDERS["skirt"](1e10), 5_150, 84_992, 101_568),
     ],
     ids=["sheet 32", "sheet 64", "sheet 128", "block", "skirt"],
 )
 def test_a_supernodal_factor_is_as_large_as_stored(scene: Scene, nonzeros: int, factor_bytes: int, flops: int):
-    factor = SupernodalCholesky(system_matrix(scene))
+    factor = SupernodalCholesky(build_system_matrix(scene))
     assert (factor.nonzeros, factor.factor_bytes, factor.flops) == (nonzeros, factor_bytes, flops)
-    # Half of the bytes for half of the precision; the work is the same.
-    single = SupernodalCholesky(system_matrix(scene), precision="float32")
+    # Half of the precision takes half of the bytes, and the same number of operations.
+    single = SupernodalCholesky(build_system_matrix(scene), precision="float32")
     assert (single.factor_bytes, single.flops) == (factor_bytes // 2, flops)
 
 
 @pytest.mark.parametrize("solver", ["dense", "sparse", "numba"])
 @pytest.mark.parametrize(("size", "iterations"), [(8, [542, 504]), (16, [506, 613])])
 def test_a_tolerance_takes_as_many_iterations_as_stored(solver: str, size: int, iterations: list[int]):
-    scene = sheet(size)
+    scene = build_sheet(size)
     stop = StopRule(max_iterations=1000, rtol=1e-3)
-    with limit_threads(THREADS):  # dense products of this size lose more by a second thread than they gain
-        steps = list(simulate_scene(scene, prepare(solver, scene), stop, initial_guess="previous", frames=2))
-    # Here an iteration changes the residual by 0.1 to 1 %, round-off by 1e-9: the number is the same everywhere.
+    with limit_threads(THREADS):  # a second thread slows down dense products of this size
+        steps = list(simulate_scene(scene, prepare_solver(solver, scene), stop, initial_guess="previous", frames=2))
+    # An iteration changes the residual by 0.1 to 1 %, and round-off by 1e-9: all machines need the same number.
     assert [step.solution.num_iterations for step in steps] == iterations
     assert {step.solution.termination_reason for step in steps} == {"converged"}
 
 
 def test_a_recording_takes_at_most_20_bytes_a_vertex_and_frame(tmp_path: Path):
-    scene, frames = sheet(64), (20, 60)
-    prepared = prepare("numba", scene)
+    scene, frames = build_sheet(64), (20, 60)
+    prepared = prepare_solver("numba", scene)
     sizes = []
     for count in frames:
         path = tmp_path / f"{count}.rrd"
-        record(scene, prepared, count, path)
+        record_steps(scene, prepared, count, path)
         sizes.append(path.stat().st_size)
-    # The difference leaves out what is written once. Springs are in every 40th frame, so 40 frames are a cycle.
+    # The difference excludes data that is written once. Every 40th frame has springs, so 40 frames are a cycle.
     per_vertex = (sizes[1] - sizes[0]) / (frames[1] - frames[0]) / len(scene.mesh.rest_positions)
     assert per_vertex <= 20.0
-    # The compressed size depends a little on the last bits of the positions and on the library's version.
+    # The compressed size depends slightly on round-off in the positions and on the version of the library.
     assert per_vertex == pytest.approx(16.3, rel=0.03)
 
 
 @dataclass
 class Factorisations:
-    """How often the Hessian was factorised: for later solves, and for one."""
+    """Numbers of factorisations of the Hessian: with a separate solve, and together with one solve."""
 
     separate: int = 0
     once: int = 0
@@ -101,11 +101,11 @@ class Factorisations:
 
 @pytest.fixture
 def factorisations(monkeypatch: pytest.MonkeyPatch) -> Factorisations:
-    """Counts the factorisations of the test."""
+    """Count the factorisations of a test."""
     found, saved, once = Factorisations(), BlockCholesky.factorise, BlockCholesky.factorise_and_solve
 
     def factorise(self: BlockCholesky, *given: Any) -> Any:
-        found.separate += self.fronts.block_size > 1  # not that of Q, whose blocks are numbers
+        found.separate += self.fronts.block_size > 1  # excludes the factorisation of Q, whose blocks are scalars
         return saved(self, *given)
 
     def factorise_and_solve(self: BlockCholesky, *given: Any) -> Any:
@@ -129,22 +129,22 @@ def factorisations(monkeypatch: pytest.MonkeyPatch) -> Factorisations:
 def test_an_accuracy_takes_as_many_iterations_as_stored(
     solver: str, size: int, iterations: list[int], saved: int, once: int, factorisations: Factorisations
 ):
-    scene, stop = sheet(size), StopRule(max_iterations=1000, rtol=1e-6)
+    scene, stop = build_sheet(size), StopRule(max_iterations=1000, rtol=1e-6)
     with limit_threads(THREADS):
         prepared = load_target(SOLVERS[solver])().prepare(scene.system)
         found = list(simulate_scene(scene, prepared, stop, initial_guess="previous", frames=3))
     assert {step.solution.termination_reason for step in found} == {"converged"}
-    # Newton's method converges quadratically: round-off decides nothing. The hybrid begins with L-BFGS, in float32
-    # unless the mesh is small. Its path may end an iteration earlier or later in each of its rounds on another
-    # processor, and where that leaves a Newton step to do it takes a factorisation, or some on an indefinite Hessian.
-    room, more = (0, 0) if solver == "newton" else (2, 4)
-    assert [step.solution.num_iterations for step in found] == pytest.approx(iterations, abs=room)
-    assert factorisations.separate == pytest.approx(saved, abs=room)
-    assert factorisations.once == pytest.approx(once, abs=more)
+    # Newton's method converges quadratically, so that round-off does not change the counts. The hybrid begins with
+    # L-BFGS, in float32 unless the mesh is small. On another processor each phase of L-BFGS may end an iteration
+    # earlier or later. A Newton step that this adds needs a factorisation, or several if the Hessian is indefinite.
+    margin, once_margin = (0, 0) if solver == "newton" else (2, 4)
+    assert [step.solution.num_iterations for step in found] == pytest.approx(iterations, abs=margin)
+    assert factorisations.separate == pytest.approx(saved, abs=margin)
+    assert factorisations.once == pytest.approx(once, abs=once_margin)
 
 
-def peak(work: Callable[[], object]) -> int:
-    """The most bytes that are allocated at once in a call, as Python's allocators see it, after one to warm up."""
+def measure_peak_bytes(work: Callable[[], object]) -> int:
+    """Return the peak of allocated bytes in a call by Python's allocators, after a warm-up call."""
     work()
     gc.collect()
     tracemalloc.start()
@@ -156,23 +156,23 @@ def peak(work: Callable[[], object]) -> int:
         tracemalloc.stop()
 
 
-def arrays(work: Callable[[], object], size: int) -> int:
-    """The same in whole arrays of the sheet's positions; what Python itself takes is less than half of one."""
-    return round(peak(work) / (24 * size**2))
+def count_arrays(work: Callable[[], object], size: int) -> int:
+    """Return the peak of allocated memory in arrays of the sheet's positions; Python itself uses less than a half."""
+    return round(measure_peak_bytes(work) / (24 * size**2))
 
 
-@pytest.mark.parametrize(("solver", "stated", "solved", "whole"), [("sparse", 3, 15, 18), ("numba", 3, 2, 6)])
-def test_a_step_allocates_as_many_arrays_as_stored(solver: str, stated: int, solved: int, whole: int):
-    scene = sheet(64)
-    prepared = prepare(solver, scene)
-    posed = build_problem(scene, build_initial_state(scene), "previous")
-    assert arrays(lambda: build_problem(scene, build_initial_state(scene), "previous"), 64) == stated
-    assert arrays(lambda: prepared.solve(posed, STOP), 64) == solved
-    assert arrays(lambda: steps(scene, prepared, 1), 64) == whole
+@pytest.mark.parametrize(("solver", "in_problem", "in_solve", "in_step"), [("sparse", 3, 15, 18), ("numba", 3, 2, 6)])
+def test_a_step_allocates_as_many_arrays_as_stored(solver: str, in_problem: int, in_solve: int, in_step: int):
+    scene = build_sheet(64)
+    prepared = prepare_solver(solver, scene)
+    problem = build_problem(scene, build_initial_state(scene), "previous")
+    assert count_arrays(lambda: build_problem(scene, build_initial_state(scene), "previous"), 64) == in_problem
+    assert count_arrays(lambda: prepared.solve(problem, STOP), 64) == in_solve
+    assert count_arrays(lambda: simulate_steps(scene, prepared, 1), 64) == in_step
 
 
 def test_idle_contact_allocates_no_array_more():
-    assert arrays(build_fall(FAR, size=64, frames=3), 64) == arrays(build_fall(size=64, frames=3), 64)
+    assert count_arrays(build_fall(FAR, size=64, frames=3), 64) == count_arrays(build_fall(size=64, frames=3), 64)
 
 
 @pytest.mark.parametrize(("solver", "frames"), [("numba", 4), ("sparse", 2)])
@@ -182,8 +182,9 @@ def test_the_same_work_retires_the_same_instructions(solver: str, frames: int):
         work()
         first, second = hardware_counters.count_events(work), hardware_counters.count_events(work)
     if first is None or second is None:
-        assert (
-            hardware_counters.explain_unavailable()
-        )  # it says why: a virtual machine hides the counter, or the kernel refuses it
+        # A virtual machine may hide the counter, or the kernel may deny access to it.
+        assert hardware_counters.explain_unavailable()
     else:
-        assert second == pytest.approx(first, rel=1e-3)  # the interpreter's own housekeeping, once in a while
+        assert second == pytest.approx(
+            first, rel=1e-3
+        )  # the interpreter adds occasional work, such as garbage collection

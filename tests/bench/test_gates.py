@@ -1,4 +1,4 @@
-"""Gates on ratios of times. Without `--benchmark-only` nothing is timed: candidate and baseline must agree."""
+"""Gates on ratios of times. Without `--benchmark-only` they only check that candidate and baseline agree."""
 
 import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
@@ -15,12 +15,12 @@ from tests.bench.solves import SOLVES
 ALL = (*GATES, *SOLVES, *CONTACT, *ACCURACY)
 
 
-def marks(gate: Gate) -> list[pytest.MarkDecorator]:
-    """Marks of a gate's test: the clock of pytest-benchmark's own figures, and whether it is of the short set."""
+def list_marks(gate: Gate) -> list[pytest.MarkDecorator]:
+    """Return the marks of a gate's test: the clock of pytest-benchmark, and `short` for the short set."""
     return [pytest.mark.benchmark(timer=CLOCK_FUNCTIONS[gate.clock]), *([pytest.mark.short] if gate.short else [])]
 
 
-@pytest.mark.parametrize("gate", [pytest.param(gate, id=gate.name, marks=marks(gate)) for gate in ALL])
+@pytest.mark.parametrize("gate", [pytest.param(gate, id=gate.name, marks=list_marks(gate)) for gate in ALL])
 def test_the_gate_passes(gate: Gate, benchmark: BenchmarkFixture, paired_benchmark: PairedBenchmark):
     with limit_threads(THREADS):
         candidate = gate.candidate()
