@@ -185,6 +185,5 @@ def test_the_same_work_retires_the_same_instructions(solver: str, frames: int):
         # A virtual machine may hide the counter, or the kernel may deny access to it.
         assert hardware_counters.explain_unavailable()
     else:
-        assert second == pytest.approx(
-            first, rel=1e-3
-        )  # the interpreter adds occasional work, such as garbage collection
+        # The interpreter adds occasional work, such as garbage collection.
+        assert second == pytest.approx(first, rel=1e-3)
