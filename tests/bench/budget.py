@@ -2,7 +2,7 @@
 
     ratio = error(recommended) / min_m error(m)      m: settings whose time is within the budget
 
-    python -m tests.bench.budget [--only NAME ...] [--rounds 5] [--search-time 30]
+    python -m tests.bench.budget [--only NAME ...] [--rounds 5] [--search-time 60]
 
 The questions are ten small scenes with a budget each. A setting is a solver with its options, an integrator and a step
 size, from a grid that is finer and wider than that of the search (`build_grid`, `REFINEMENTS`). One pass measures all
