@@ -49,7 +49,7 @@ FLOORS: dict[str, tuple[Any, float | None]] = {
 }
 """Effect, and the activation distance of barriers relative to the minimum distance."""
 MIN_DISTANCE, NUM_WARMUP_STEPS = 0.005, 2
-STOP, MAX_ITERATIONS = StopRule(500, 1e-6), 500
+STOP = StopRule(500, 1e-6)
 HARD_CASES = ("thrown-1e4", "at-the-thickness")
 """The hard cases whose obstacle is a plane and whose mesh is small."""
 
@@ -95,7 +95,7 @@ def simulate_interleaved(
                 began = thread_time()
                 step = next(steps[j])
                 seconds[j, k] = min(seconds[j, k], thread_time() - began)
-                limited[j] += step.num_iterations >= MAX_ITERATIONS
+                limited[j] += step.solution.termination_reason == "max-iter"
                 ends[j] = step.positions.copy()
                 lowest[j] = min(lowest[j], float(ends[j][:, 1].min()))
     return [Motion(*it) for it in zip(seconds, ends, limited.tolist(), lowest.tolist(), strict=True)]
