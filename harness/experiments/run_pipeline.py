@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from springbench.harness.atomic_files import atomic_write
 from springbench.harness.config.sweep_config import RunSpec
 from springbench.harness.errors import InputError, RunFailed
 from springbench.harness.execution import machine_info
@@ -51,6 +50,7 @@ from springbench.harness.reference.gradient_check import measure_gradient_errors
 from springbench.harness.reference.residual_audit import AuditedSolver
 from springbench.harness.reference.step_verifier import StepVerifier, compute_reference_positions
 from springbench.harness.results import parquet_rows
+from springbench.harness.results.position_file import save_positions
 from springbench.harness.results.quantities import compute_ms_per_step
 from springbench.harness.scenes.effects.springs_effect import SpringsEffect
 from springbench.harness.scenes.scene_builder import Scene, build_scene
@@ -498,17 +498,3 @@ def _open_recorder(job: RunJob, scene: Scene, outcome: Mapping[str, Any], *final
             obstacles=list_obstacles(run.scene.effects),
         ),
     )
-
-
-def save_positions(path: Path, positions: np.ndarray) -> None:
-    """Store positions in a partial file and rename it.
-
-    Args:
-        path: file (.npz), whose only array is `positions`.
-        positions: positions after each step (frames, n, 3) [m].
-
-    Raises:
-        WriteError: the file cannot be written.
-    """
-    with atomic_write(path) as partial:
-        np.savez_compressed(partial, positions=positions)

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterable
 from functools import cache
 from hashlib import sha256
 from typing import Any, NamedTuple
 
-from springbench.harness.execution.source_cache import read_cached_text
-from springbench.solvers.registry import OPTIONAL_SOLVERS, SOLVERS, find_solver_info, load_target
+from springbench.harness.results.solver_metadata import read_registered_traits
+from springbench.solvers.registry import OPTIONAL_SOLVERS, SOLVERS
 
 PAGE_WIDTH, PAGE_HEIGHT, PAGE_DPI = 1600, 900, 100
 """Size of every picture [pixels], and the dots per inch that convert it into the size of a Matplotlib figure."""
@@ -178,13 +177,9 @@ def _shipped_solver_styles(names: tuple[str, ...]) -> dict[str, SeriesStyle]:
     the shades of their family, get no style here.
     """
     families: dict[str, list[str]] = {}
-    targets = {name: (SOLVERS | OPTIONAL_SOLVERS)[name] for name in names}
-
-    def find_families() -> str:
-        return json.dumps({name: find_solver_info(load_target(of), name).family for name, of in targets.items()})
-
-    for name, family in json.loads(read_cached_text("families", find_families, json.dumps(targets))).items():
-        families.setdefault(family, []).append(name)
+    traits = read_registered_traits()
+    for name in names:
+        families.setdefault(traits[name].family, []).append(name)
     markers = dict(zip(names, _ALL_MARKERS, strict=False))
     return {
         name: SeriesStyle(shade_colour(color, by), markers[name], dash)

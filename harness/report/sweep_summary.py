@@ -12,6 +12,7 @@ from textwrap import wrap
 import pyarrow as pa
 from springbench.harness.config.shipped_configs import get_config_name
 from springbench.harness.report import equal_accuracy
+from springbench.harness.report.energy_losses import NOTABLE_SHARE, describe_losses, format_share
 from springbench.harness.report.equal_accuracy import compare_runs
 from springbench.harness.report.timing_table import TABLE_WIDTH, RunTimes, label_runs, read_run_times
 
@@ -25,8 +26,8 @@ If the growth also exceeds that of the 99th percentile by this factor, it is att
 """
 
 
-NOTABLE_SHARE, MAX_DISSIPATION_SENTENCES = 0.01, 3
-"""Share of the provided energy above which dissipation is reported, and the maximum number of sentences on it."""
+MAX_DISSIPATION_SENTENCES = 3
+"""Maximum number of sentences on dissipation."""
 
 
 def build_closing_lines(table: pa.Table, config: Path, results: Path, folder: Path) -> list[str]:
@@ -185,7 +186,7 @@ def _describe_dissipation(ok_runs: Sequence[RunTimes], names: Mapping[str, str])
         run = max(unsolved, key=lambda run: abs(run.solve_share or 0.0))
         share = run.solve_share or 0.0
         yield (
-            f"Unconverged solves {'took' if share > 0 else 'added'} up to {_format_share(share)} of the energy "
+            f"Unconverged solves {'took' if share > 0 else 'added'} up to {format_share(share)} of the energy "
             f"({names[run.run_id]} on {run.scene}{f' {run.size}' if run.size else ''}, column `dissipation_solve`): "
             "more iterations change the motion."
         )
@@ -205,28 +206,6 @@ def _describe_losses(run: RunTimes) -> str:
     return f"{words}."
 
 
-def describe_losses(
-    name: str, seconds: float, integrator: float, damping: float, friction: float, *, by_engine: bool = False
-) -> str:
-    """Describe the shares of the energy that an integrator, damping and friction dissipated.
-
-    Args:
-        name: name of the integrator or engine.
-        seconds: simulated time [s].
-        integrator, damping, friction: shares of the provided energy.
-        by_engine: whether the integrator's share includes unconverged solves.
-
-    Returns:
-        A sentence without its full stop.
-    """
-    others = [(damping, "damping effects"), (friction, "friction")]
-    effects = " and ".join(f"{what} {_format_share(share)}" for share, what in others if share >= NOTABLE_SHARE / 2)
-    return (
-        f"{name} {'took' if integrator > 0 else 'added'} {_format_share(integrator)} of the energy in "
-        f"{seconds:.3g} s{' by its integrator and its solves' if by_engine else ''}{', ' if effects else ''}{effects}"
-    )
-
-
 def _name_integrator(run: RunTimes) -> str:
     """Return the integrator of a run; the solver, where it integrates frames itself."""
     return (run.integrator or "") if _has_steps_of_integrator(run) else run.solver
@@ -240,10 +219,6 @@ def _has_steps_of_integrator(run: RunTimes) -> bool:
 def _integration_share(run: RunTimes) -> float:
     """Return the share that the integrator dissipated, including the solves of an engine."""
     return (run.integrator_share if run.engine_share is None else run.engine_share) or 0.0
-
-
-def _format_share(share: float) -> str:
-    return f"{100 * abs(share):.2g} %" if abs(share) < 1 else f"{100 * abs(share):.0f} %"
 
 
 def _choose_recording(timed_runs: Sequence[RunTimes], recordings: Path) -> Path | None:

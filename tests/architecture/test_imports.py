@@ -20,12 +20,16 @@ PROGRAM = (
 )
 
 
-def loads(arguments: list[str], cache: Path) -> list[str]:
-    """The modules that a command has loaded when it ends."""
+def loads(arguments: list[str], cache: Path, program: str = PROGRAM) -> list[str]:
+    """The modules that a command, or a program, has loaded when it ends."""
     completed = subprocess.run(
-        [sys.executable, "-c", PROGRAM, *arguments],
+        [sys.executable, "-c", program, *arguments],
         cwd=ROOT,
-        env={**os.environ, "PYTHONPATH": str(ROOT), "XDG_CACHE_HOME": str(cache)},
+        env={
+            **os.environ,
+            "PYTHONPATH": os.pathsep.join([str(ROOT / ".src"), str(ROOT)]),
+            "XDG_CACHE_HOME": str(cache),
+        },
         capture_output=True,
         text=True,
     )
@@ -59,3 +63,28 @@ def test_a_command_without_pictures_imports_neither_plotting_nor_recording(
     assert not without & set(loaded)
     # A module takes a third of a millisecond at the least: there are 188 to help, 700 to list, 1,950 with pictures.
     assert len(loaded) < fewer
+
+
+CONTROL = "springbench.harness.cli.commands.error_control"
+LISTING = f"""
+import atexit, sys; atexit.register(lambda: print('loaded', *sys.modules))
+import {CONTROL}
+from springbench.harness.experiments.error_control.candidate_methods import list_candidate_methods, list_contact_methods
+assert list_candidate_methods() and list_contact_methods()
+"""
+
+
+def test_error_control_imports_neither_sweeps_nor_solvers_that_it_does_not_try(tmp_path: Path) -> None:
+    loads([], tmp_path, LISTING)  # the first time it reads the traits of all solvers, and caches them
+    loaded = set(loads([], tmp_path, LISTING))
+    assert CONTROL in loaded
+    assert not (DRAWING | {"duckdb"}) & loaded
+    own = {"run_pipeline", "sweep_runner", "sweep_summary", "timing_table"}
+    assert not {name for name in loaded if name.startswith("springbench.harness.") and name.split(".")[-1] in own}
+    untried = ("position_based", "local_global", "quasi_newton")
+    assert not {name for name in loaded if any(f"solvers.methods.{family}." in name for family in untried)}
+
+
+def test_the_process_that_draws_inherits_all_of_pyvista(tmp_path: Path) -> None:
+    program = "import springbench.harness.report.run_picture, sys; print('loaded', *sys.modules)"
+    assert "pyvista.plotting" in loads([], tmp_path, program)

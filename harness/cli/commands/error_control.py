@@ -39,14 +39,14 @@ from springbench.harness.experiments.error_control.stored_trials import (
     select_best_predicted,
 )
 from springbench.harness.experiments.provenance import build_provenance_columns
-from springbench.harness.experiments.run_pipeline import save_positions
 from springbench.harness.recording.recorder_interface import RecordedFrame, RecordingInfo
 from springbench.harness.recording.strain_shading import compute_strain_range
 from springbench.harness.reference.perturbation_growth import PerturbationGrowth
 from springbench.harness.reference.self_converged_trajectory import describe_self_convergence
-from springbench.harness.report.sweep_summary import describe_losses
+from springbench.harness.report.energy_losses import describe_losses
 from springbench.harness.results import parquet_rows
 from springbench.harness.results.folder_ownership import claim_folder
+from springbench.harness.results.position_file import save_positions
 from springbench.harness.results.quantities import DISSIPATION_CAUSES
 from springbench.harness.results.solver_metadata import read_solver_metadata
 from springbench.harness.scenes.scene_builder import Scene

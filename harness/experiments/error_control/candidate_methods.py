@@ -12,6 +12,7 @@ from springbench.harness.errors import InputError, RunFailed
 from springbench.harness.execution.progress_display import ThrottledMessages
 from springbench.harness.reference.self_converged_trajectory import LIMIT_INTEGRATORS, has_contact
 from springbench.harness.reference.step_snapshot import build_exact_scene
+from springbench.harness.results.solver_metadata import read_registered_traits
 from springbench.harness.scenes.scene_builder import Scene
 from springbench.harness.scenes.scene_spec import SceneSpec
 from springbench.harness.simulation.adaptive_stepping import AdaptiveImplicitStepper, Stepper
@@ -121,7 +122,7 @@ def list_candidate_methods() -> list[tuple[str, SolverSpec]]:
     """
     pairs = {name: one for name, one in INTEGRATORS.items() if isinstance(one, RungeKutta) and one.embedded_order}
     best = max(pairs, key=lambda name: (pairs[name].order, pairs[name].stage_order))
-    infos = {name: find_solver_info(load_target(target), name) for name, target in SOLVERS.items()}
+    traits = read_registered_traits()
     single = {
         name: one.order
         for name, one in INTEGRATORS.items()
@@ -129,9 +130,9 @@ def list_candidate_methods() -> list[tuple[str, SolverSpec]]:
     }
     even = max((name for name in single if name != "substepping"), key=single.__getitem__)
     tried = {
-        name: ("substepping",) if one.is_substepping else (best, even)
-        for name, one in infos.items()
-        if one.supports_error_control
+        name: ("substepping",) if traits[name].is_substepping else (best, even)
+        for name in SOLVERS
+        if traits[name].supports_error_control
     }
     found = [(integrator, SolverSpec(name, {})) for name, several in tried.items() for integrator in several]
     return sorted(found, key=lambda pair: pair[0] != "substepping")
@@ -139,10 +140,8 @@ def list_candidate_methods() -> list[tuple[str, SolverSpec]]:
 
 def list_contact_methods() -> list[tuple[str, SolverSpec]]:
     """Return the integrators that support contact, combined with the first minimising solver of each family."""
-    solvers = {name: load_target(target) for name, target in SOLVERS.items()}
-    first = [
-        name for name, one in solvers.items() if is_minimiser(one) and find_solver_info(one, name).is_family_default
-    ]
+    traits = read_registered_traits()
+    first = [name for name in SOLVERS if traits[name].is_minimiser and traits[name].is_family_default]
     return [(integrator, SolverSpec(name, {})) for name in first for integrator in LIMIT_INTEGRATORS]
 
 
