@@ -18,6 +18,7 @@ import numpy as np
 import pyvista as pv
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFilter
+from pyvista.plotting import Plotter  # imported here, so that processes that draw inherit it
 from springbench.harness.recording.recorder_interface import RecordingReplay
 from springbench.harness.recording.strain_scale import PIN_COLOUR
 from springbench.harness.report import opengl_probe
@@ -226,7 +227,7 @@ class OffscreenRenderer:
         self._mesh_lines, self._page = mesh_lines, background
         self._pixels, self._height = width * height, height
         size = [_SUPERSAMPLING * width, _SUPERSAMPLING * height]
-        self._plotter = pv.Plotter(off_screen=True, window_size=size, lighting="none")
+        self._plotter = Plotter(off_screen=True, window_size=size, lighting="none")
         self._plotter.background_color = pv.Color(background or "white")
         self._plotter.disable_anti_aliasing()
         # Lights are attached to the camera (key light at the upper left), so that all views are lit alike; the fill
@@ -264,6 +265,7 @@ class OffscreenRenderer:
             Pixels (height, width, 3), or 4 channels without a background.
         """
         plotter = self._plotter
+        plotter.suppress_rendering = True  # otherwise the scene is rendered again with each mesh that is added
         plotter.clear_actors()
         # Scaling by a power of two is exact: scenes of all sizes render alike, and scenes of size 1 are unchanged.
         unit = 2.0 ** -round(math.log2(float(np.linalg.norm(view.position - view.target))))
@@ -288,6 +290,7 @@ class OffscreenRenderer:
             shape.points = unit * np.asarray(solid.points, np.float64)
             plotter.add_mesh(shape, color=_OBSTACLE_COLOUR, smooth_shading=solid.n_cells > 6, **_MATERIAL_OPTIONS)
         plotter.reset_camera_clipping_range()
+        plotter.suppress_rendering = False
         plotter.render()
         clear = self._page is None
         pixels = np.asarray(plotter.screenshot(None, return_img=True, transparent_background=clear))

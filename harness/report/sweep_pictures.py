@@ -96,7 +96,12 @@ def preload_drawing() -> None:
         problem = opengl_probe.find_opengl_problem()
     if problem is not None:
         return
-    for name in ("springbench.harness.recording.recording_reader", "pyvista", "springbench.harness.report.run_picture"):
+    for name in (
+        "springbench.harness.recording.recording_reader",
+        "pyvista",
+        "pyvista.plotting",
+        "springbench.harness.report.run_picture",
+    ):
         with lock_timing_shared(_ignore_progress):
             import_module(name)
 

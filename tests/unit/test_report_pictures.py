@@ -182,6 +182,20 @@ def test_each_frame_is_drawn_as_it_would_be_alone(triangles: bool) -> None:
 
 
 @needs_opengl
+def test_each_frame_is_rendered_once() -> None:
+    replay, frames = build_strained_frames(True)
+    view = fit_camera(frames[1].positions[0], aspect=1.0, angles=(20.0, 10.0))
+    rendered = list[str]()
+    with OffscreenRenderer(160, 160) as studio:
+        studio.render_frame(replay, 0, view)
+        window: Any = studio._plotter.render_window
+        window.AddObserver("EndEvent", lambda _, event: rendered.append(event))
+        for k in (1, 2):
+            studio.render_frame(replay, k, view)
+    assert len(rendered) == 2
+
+
+@needs_opengl
 def test_each_frame_is_drawn_in_its_own_colours_and_positions() -> None:
     """Drawn out of order, by one window."""
     replay, frames = build_strained_frames(True)
