@@ -124,9 +124,6 @@ def run(
 ) -> None:
     """Run the missing runs of a sweep, or of one scene."""
     from springbench.harness.config.config_loader import load_config
-    from springbench.harness.execution.progress_display import create_display
-    from springbench.harness.experiments.sweep_runner import ExecutionOptions, run_sweep
-    from springbench.harness.results.folder_ownership import claim_folder
 
     require_output_file(positions, ".npz", "--positions")
     with_error = {"t_end": t_end, "verify": verify, "compare": compare}
@@ -159,6 +156,15 @@ def run(
         key = f"--{name.replace('_', '-')}"
         raise InputError(InputMistake("applies only to a run with --error; leave it out", key=key))
     sweep = load_config(config, solvers=solver or (), sizes=size or (), **context.obj)
+    runs = sweep.list_runs()
+    if any(one.threads == "auto" for one in runs):
+        from springbench.harness.execution.machine_info import start_load_sample
+
+        start_load_sample()
+    from springbench.harness.execution.progress_display import create_display
+    from springbench.harness.experiments.sweep_runner import ExecutionOptions, run_sweep
+    from springbench.harness.results.folder_ownership import claim_folder
+
     if not in_process and not can_isolate_processes():
         print_message("runs share this process, without limits of time and memory: worker processes need Linux")
     if sweep.options.record and not RECORDINGS.is_installed():
@@ -166,7 +172,7 @@ def run(
     folder = claim_folder(results / sweep.name, config)
     swept = run_sweep(
         sweep.name,
-        sweep.list_runs(),
+        runs,
         folder,
         create_display(get_error_console()),
         print_message,
@@ -189,7 +195,7 @@ def _preload_reports() -> None:
 
     with lock_timing_shared(lambda message: None):
         import_module("springbench.harness.report.sweep_summary")
-        import_module("springbench.harness.report.site")
+        import_module("springbench.harness.report.site.sweep_overview")
 
 
 def _report_sweep(sweep: SweepPlan, swept: SweepResults, config: Path, results: Path, folder: Path) -> list[str]:

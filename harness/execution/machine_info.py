@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from functools import cache, lru_cache
 from importlib import import_module
 from pathlib import Path
+from time import perf_counter, process_time, sleep
 from typing import Any, Literal
 
 from springbench.harness.errors import InputError, InputMistake
@@ -22,7 +23,7 @@ from springbench.solvers.platform_calls import list_usable_cores, measure_memory
 _PROJECT_ROOT = Path(__file__).resolve().parents[2]
 _PACKAGES = ("harness", "solvers")
 _LOAD_SAMPLE_SECONDS, _IDLE_ROUND_UP = 0.3, 0.25
-"""Duration of the sample of core usage [s], and total load [cores] that still counts as idle."""
+"""Least duration of the sample of core usage [s], and total load [cores] that still counts as idle."""
 
 _REPORTED_LIBRARIES = ("numpy", "scipy", "numba", "llvmlite", "cholespy", "pyarrow", "rerun-sdk", "pyvista", "vtk")
 
@@ -154,17 +155,35 @@ def choose_threads(requested: int | Literal["auto"]) -> ThreadChoice:
 
 
 @cache
+def start_load_sample() -> tuple[float, float]:
+    """Start to sample the usage of the cores, for `choose_threads("auto")`.
+
+    A command that calls this before its imports does not wait for the sample afterwards.
+
+    Returns:
+        Wall time and processor time of this process [s] at the start of the sample.
+    """
+    import psutil  # only here: it takes as long to import as the rest of this module
+
+    psutil.cpu_percent(None, percpu=True)  # the next call returns the usage since this one
+    return perf_counter(), process_time()
+
+
+@cache
 def _count_idle_cores() -> ThreadChoice:
     """Count the cores that other processes leave idle.
 
     It is computed once, so that all runs use the same number.
     """
-    import psutil  # only here: it takes as long to import as the rest of this module
+    import psutil
 
     usable = _count_usable_cores()
     mine = list_usable_cores()
-    busy = psutil.cpu_percent(_LOAD_SAMPLE_SECONDS, percpu=True)
-    idle = sum(1.0 - busy[core] / 100 for core in mine if core < len(busy))
+    began, own_seconds = start_load_sample()
+    sleep(max(0.0, began + _LOAD_SAMPLE_SECONDS - perf_counter()))
+    busy = psutil.cpu_percent(None, percpu=True)
+    own_share = max(0.0, (process_time() - own_seconds) / (perf_counter() - began))  # a fork starts at 0
+    idle = min(len(mine), own_share + sum(1.0 - busy[core] / 100 for core in mine if core < len(busy)))
     number = min(usable, max(1, int(idle + _IDLE_ROUND_UP)))
     load = read_load_average()
     return ThreadChoice(

@@ -174,9 +174,13 @@ def set_core_loads(monkeypatch: pytest.MonkeyPatch):
         monkeypatch.setattr(machine_info.os, "sched_getaffinity", lambda _: {0, 1, 2, 3})
         monkeypatch.setattr(psutil, "cpu_percent", lambda _, percpu: list(busy))
 
-    machine_info._count_idle_cores.cache_clear()
+    def forget() -> None:
+        machine_info._count_idle_cores.cache_clear()
+        machine_info.start_load_sample.cache_clear()
+
+    forget()
     yield pretend
-    machine_info._count_idle_cores.cache_clear()
+    forget()
 
 
 @pytest.mark.parametrize(
@@ -188,6 +192,23 @@ def test_threads_are_as_many_as_there_are_idle_cores(set_core_loads, busy: tuple
     found = machine_info.choose_threads("auto")
     assert found.count == number
     assert f"{number} of 4" in found.reason
+
+
+def test_the_work_of_this_process_during_the_sample_is_no_load(set_core_loads, monkeypatch: pytest.MonkeyPatch):
+    set_core_loads(100, 0, 0, 100)
+    monkeypatch.setattr(machine_info, "process_time", machine_info.perf_counter)  # it computes all the time
+    machine_info.start_load_sample()
+    assert machine_info.choose_threads("auto").count == 3
+
+
+def test_nobody_waits_for_a_sample_that_started_early_enough(set_core_loads, monkeypatch: pytest.MonkeyPatch):
+    set_core_loads(0, 0, 0, 0)
+    waits = list[float]()
+    monkeypatch.setattr(machine_info, "sleep", waits.append)
+    began, _ = machine_info.start_load_sample()
+    monkeypatch.setattr(machine_info, "perf_counter", lambda: began + 10.0)
+    machine_info.choose_threads("auto")
+    assert waits == [0.0]
 
 
 def test_a_number_that_was_given_stays(set_core_loads):
