@@ -21,13 +21,15 @@ def describe_losses(
         A sentence without its full stop.
     """
     others = [(damping, "damping effects"), (friction, "friction")]
-    effects = " and ".join(f"{what} {format_share(share)}" for share, what in others if share >= NOTABLE_SHARE / 2)
+    effects = " and ".join(
+        f"{what} {format_energy_share(share)}" for share, what in others if share >= NOTABLE_SHARE / 2
+    )
     return (
-        f"{name} {'took' if integrator > 0 else 'added'} {format_share(integrator)} of the energy in "
+        f"{name} {'took' if integrator > 0 else 'added'} {format_energy_share(integrator)} of the energy in "
         f"{seconds:.3g} s{' by its integrator and its solves' if by_engine else ''}{', ' if effects else ''}{effects}"
     )
 
 
-def format_share(share: float) -> str:
+def format_energy_share(share: float) -> str:
     """Return a share in percent."""
     return f"{100 * abs(share):.2g} %" if abs(share) < 1 else f"{100 * abs(share):.0f} %"

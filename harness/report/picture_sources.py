@@ -36,9 +36,10 @@ def digest_runs(title: str, table: pa.Table, stale_ids: Collection[str]) -> str:
 
 
 def read_sources(path: Path) -> str | None:
-    """Return the digest stored in a picture; None if there is none, or the picture is missing or unreadable.
+    """Return the digest stored in a picture, or None.
 
-    Only the chunks before the pixels are read, without an imaging library, whose import takes longer than all else.
+    It is None if there is no digest, or if the picture is missing or unreadable. Only the chunks before the pixels are
+    read, without an imaging library, whose import takes far longer.
     """
     keyword = f"{SOURCES_KEY}\0".encode("latin-1")
     with suppress(OSError, struct.error), path.open("rb") as file:

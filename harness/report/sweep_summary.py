@@ -12,7 +12,7 @@ from textwrap import wrap
 import pyarrow as pa
 from springbench.harness.config.shipped_configs import get_config_name
 from springbench.harness.report import equal_accuracy
-from springbench.harness.report.energy_losses import NOTABLE_SHARE, describe_losses, format_share
+from springbench.harness.report.energy_losses import NOTABLE_SHARE, describe_losses, format_energy_share
 from springbench.harness.report.equal_accuracy import compare_runs
 from springbench.harness.report.timing_table import TABLE_WIDTH, RunTimes, label_runs, read_run_times
 
@@ -186,7 +186,7 @@ def _describe_dissipation(ok_runs: Sequence[RunTimes], names: Mapping[str, str])
         run = max(unsolved, key=lambda run: abs(run.solve_share or 0.0))
         share = run.solve_share or 0.0
         yield (
-            f"Unconverged solves {'took' if share > 0 else 'added'} up to {format_share(share)} of the energy "
+            f"Unconverged solves {'took' if share > 0 else 'added'} up to {format_energy_share(share)} of the energy "
             f"({names[run.run_id]} on {run.scene}{f' {run.size}' if run.size else ''}, column `dissipation_solve`): "
             "more iterations change the motion."
         )

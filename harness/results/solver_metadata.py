@@ -35,7 +35,10 @@ class SolverTraits(NamedTuple):
 
 
 def read_registered_traits() -> dict[str, SolverTraits]:
-    """Return the traits of all registered solvers by name, from a cache: reading them imports all solvers."""
+    """Return the traits of all registered solvers by name.
+
+    They are cached on disk, because reading them imports all solvers.
+    """
     targets = SOLVERS | OPTIONAL_SOLVERS
 
     def describe_traits() -> str:
