@@ -166,8 +166,10 @@ RUN_COLUMNS = (
         "solver_phases",
         _TEXT,
         "",
-        "methods that the solver switched between in the step, each with its iterations and its share of the cost, "
-        "counted in operations; null for a solver of one method",
+        "methods that the solver switched between in the step, each with its iterations, its time and its share of the "
+        "cost; the time is the processor time of the solving thread in the untimed pass, from the start of the method "
+        "to that of the next one, checks included; the cost is counted in operations, and decides which method "
+        "continues; null for a solver of one method",
     ),
     ColumnSpec(
         "residual",

@@ -12,12 +12,14 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from itertools import islice
+from time import thread_time
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from springbench.harness.recording.recorder_interface import RecordedFrame, RunRecorder
+from springbench.harness.results.solver_phases import format_phases
 from springbench.harness.scenes.scene_builder import Scene
 from springbench.harness.scenes.spring_strains import compute_strains
 from springbench.harness.simulation.energy_balance import (
@@ -37,6 +39,7 @@ from springbench.harness.simulation.timing_pass import (
     iterate_steps,
 )
 from springbench.solvers.contact.half_space.half_space_potential import HalfSpaceContact
+from springbench.solvers.iteration.phase_clock import measure_phases
 from springbench.solvers.model.energies.augmented_lagrangian import length_errors
 from springbench.solvers.model.step_problem import Positions, PreparedSolver, ProjectiveEnergy, StepProblem, System
 from springbench.solvers.model.system_matrix_assembly import assemble_system_matrix, energy_norm
@@ -155,7 +158,7 @@ def observe_run(
             drawn = terms, residual, step.num_iterations, collect_forces(step), columns["num_intersections"]
             recorder.record_frame(RecordedFrame(step.index, scene.compute_time(step.index), step.positions, *drawn))
 
-    with ThreadPoolExecutor(1) as executor:
+    with ThreadPoolExecutor(1) as executor, measure_phases(thread_time):
         observed: Future[None] | None = None
         if recorder:
             observed = executor.submit(
@@ -211,7 +214,7 @@ def build_solution_columns(
         "friction_iterations": step.friction_rounds.num_iterations if step.friction_rounds else None,
         "friction_relative_change": step.friction_rounds.relative_change if step.friction_rounds else None,
         "termination_reason": find_termination_reason(step),
-        "solver_phases": describe_phases(step),
+        "solver_phases": format_phases(solution.solver_phases or {} for _, solution in step.stages),
         "residual": residual,
         "residual_last": s.residual,
         "residual_iterate": s.residual_iterate,
@@ -282,23 +285,6 @@ def compute_returned_residual(prepared: PreparedSolver, step: SimulationStep) ->
 def find_termination_reason(step: SimulationStep) -> str:
     """Return the termination reason of the least converged stage."""
     return min((solution.termination_reason for _, solution in step.stages), key=_REASON_ORDER.index)
-
-
-def describe_phases(step: SimulationStep) -> str | None:
-    """Describe the methods that a step's solves switched between.
-
-    Each has its iterations and its share of the counted cost, summed over the stages.
-
-    Returns:
-        The description; None for a solver of one method.
-    """
-    counts: dict[str, int] = {}
-    costs: dict[str, float] = {}
-    for _, solution in step.stages:
-        for name, (count, cost) in (solution.solver_phases or {}).items():
-            counts[name], costs[name] = counts.get(name, 0) + count, costs.get(name, 0.0) + cost
-    whole = sum(costs.values()) or 1.0
-    return "; ".join(f"{name} {count} ({costs[name] / whole:.0%})" for name, count in counts.items()) or None
 
 
 def compute_strain_columns(scene: Scene, p: Positions) -> dict[str, float]:

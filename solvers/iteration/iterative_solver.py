@@ -98,8 +98,8 @@ class SolverState(ABC):
         return None
 
     @property
-    def solver_phases(self) -> Mapping[str, tuple[int, float]] | None:
-        """Iterations and counted cost of each method so far.
+    def solver_phases(self) -> Mapping[str, tuple[int, float, float]] | None:
+        """Iterations, counted cost and time [s] of each method so far.
 
         It is None for a solver that does not switch between methods.
         """

@@ -450,8 +450,8 @@ class Solution:
         velocity: (n, 3) [m/s], for a method that computes its own.
         residual_iterate: the iterate of the residual.
         warm_start: warm start of the next solve, of any shape.
-        solver_phases: iterations and counted cost of each method that a solve switched between, by the order of use;
-            None for a solver of one method.
+        solver_phases: iterations, counted cost and time [s] of each method that a solve switched between, by the order
+            of use, with the times of `springbench.solvers.iteration.phase_clock`; None for a solver of one method.
 
     Example:
         >>> scene = springbench.load_scene("configs/scenes/chain.yaml")
@@ -469,7 +469,7 @@ class Solution:
     velocity: Positions | None = None
     residual_iterate: ResidualIterate = "returned"
     warm_start: NDArray[np.float64] | None = None
-    solver_phases: Mapping[str, tuple[int, float]] | None = None
+    solver_phases: Mapping[str, tuple[int, float, float]] | None = None
 
 
 class PreparedSolver(Protocol):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import islice
+from itertools import count, islice
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ from springbench.harness.reference.exact_lengths import StationarityEvaluator
 from springbench.harness.scenes.scene_builder import build_scene
 from springbench.harness.simulation.time_loop import prepare, simulate_scene
 from springbench.solvers.iteration.descent_method import DescentPoint, ResidualMetric
+from springbench.solvers.iteration.phase_clock import measure_phases
 from springbench.solvers.kernels import descent_rounds
 from springbench.solvers.linalg.cholesky import symbolic_factorisation
 from springbench.solvers.linalg.cholesky.block_cholesky import BlockCholesky
@@ -50,13 +51,13 @@ def test_stiff_springs_take_less_than_half_of_newtons_factorisations(ratio, monk
     best, start = min(map(given.value, ends)), given.value(given.current_positions)
     done = count_factorisations(monkeypatch)
 
-    def count(solver) -> int:
+    def count_until_close(solver) -> int:
         before = len(done)
         iterates = islice(prepared[solver].iterates(given), 3000)
         next(p for p in iterates if given.value(p) - best <= 1e-4 * (start - best))
         return len(done) - before
 
-    assert count(HybridNewton()) < 0.5 * count(NewtonSolver())
+    assert count_until_close(HybridNewton()) < 0.5 * count_until_close(NewtonSolver())
 
 
 def count_factorisations(monkeypatch: pytest.MonkeyPatch) -> list[str]:
@@ -203,10 +204,26 @@ def test_the_phases_of_a_solve_add_up_to_its_iterations(ratio, names):
     one, two = (prepared.solve(given, StopRule(300, 1e-4)) for _ in range(2))
     assert one.solver_phases is not None
     assert set(one.solver_phases) == names
-    assert sum(count for count, _ in one.solver_phases.values()) == one.num_iterations
-    assert all(cost > 0.0 for _, cost in one.solver_phases.values())
+    assert sum(count for count, _, _ in one.solver_phases.values()) == one.num_iterations
+    assert all(cost > 0.0 for _, cost, _ in one.solver_phases.values())
     assert one.solver_phases == two.solver_phases
     np.testing.assert_array_equal(one.positions, two.positions)
+
+
+@pytest.mark.parametrize("ratio", [0.1, 1e6])
+def test_the_clock_is_read_where_the_method_changes_and_decides_nothing(ratio):
+    """A clock that advances by one at each reading: the times of the phases are all of those between its readings."""
+    given, prepared = stiff(ratio), HybridNewton().prepare(stiff(ratio).system)
+    unmeasured, readings = prepared.solve(given, StopRule(300, 1e-4)), count()
+    with measure_phases(lambda: float(next(readings))):
+        found = prepared.solve(given, StopRule(300, 1e-4))
+    assert found.solver_phases is not None
+    assert unmeasured.solver_phases == {name: (n, cost, 0.0) for name, (n, cost, _) in found.solver_phases.items()}
+    np.testing.assert_array_equal(found.positions, unmeasured.positions)
+    num_readings = next(readings)
+    assert sum(seconds for _, _, seconds in found.solver_phases.values()) == num_readings - 1
+    assert all(seconds > 0.0 for _, _, seconds in found.solver_phases.values())
+    assert num_readings == len(found.solver_phases) + 1  # none of the methods is used twice
 
 
 def test_a_solve_ends_at_the_first_of_its_iterates_that_satisfies_the_tolerance():

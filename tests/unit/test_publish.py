@@ -218,6 +218,20 @@ def test_a_repetition_without_a_recording_has_another_id(
     assert claims_of(with_rows_of(runs, new), renamed) == []
 
 
+@pytest.mark.parametrize(("again", "is_met"), [("4 (7.5 ms, 100% of cost)", True), ("5 (0.2 ms, 100% of cost)", False)])
+def test_times_of_phases_are_not_confirmed_but_their_iterations_are(
+    again: str, is_met: bool, repeated_runs: tuple[list[PublishedRun], list[list[ResultRow]]]
+):
+    runs, new = repeated_runs
+    published = [
+        replace(one, rows=[row | {"solver_phases": "lbfgs 4 (0.2 ms, 100% of cost)"} for row in one.rows])
+        for one in with_rows_of(runs, new)
+    ]
+    repeated = [[row | {"solver_phases": f"lbfgs {again}"} for row in found] for found in new]
+    refuted = claims_of(published, repeated)
+    assert not refuted if is_met else any("columns: " in line and "solver_phases" in line for line in refuted)
+
+
 def test_missing_or_repeated_rows_are_refuted(repeated_runs: tuple[list[PublishedRun], list[list[ResultRow]]]):
     runs, new = repeated_runs
     for one, here in zip(runs, new, strict=True):

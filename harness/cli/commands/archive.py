@@ -127,7 +127,8 @@ def verify_one_archive(archive: Path, seed: int | None, *, with_user_code: bool)
         )
     for claim in claims:
         print_message(str(claim))
-    print_message(f"columns that a repeated run cannot confirm: {', '.join(sorted(checks.IRREPRODUCIBLE_COLUMNS))}")
+    unconfirmed = ", ".join(sorted(checks.IRREPRODUCIBLE_COLUMNS))
+    print_message(f"columns that a repeated run cannot confirm: {unconfirmed}, and the times in solver_phases")
     states = {claim.verdict for claim in claims}
     bad, unknown = checks.ClaimVerdict.FAIL in states, checks.ClaimVerdict.INCONCLUSIVE in states or not claims
     print_message(

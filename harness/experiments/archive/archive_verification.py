@@ -2,11 +2,12 @@
 
 All checksums are compared, and the names and options of all runs with those of their configs. Then a random tenth of
 the runs is repeated on this machine, each with another solver's run on the same scene and size. Positions after every
-step, and all columns except IRREPRODUCIBLE_COLUMNS, must be bitwise identical. A step's time must match the published
-one within a factor of MAX_SECONDS_RATIO. The ratio of the two solvers' times is compared step by step
-(`springbench.harness.results.bootstrap_statistics.estimate_slowdown`). It must match within MAX_RATIO_SAME_MACHINE on
-the published machine type, and within OTHER_MACHINE_FACTOR on others. With another machine, or other libraries, source
-code or numbers of threads, a difference is inconclusive. So is a run that no config requests.
+step, and all columns except IRREPRODUCIBLE_COLUMNS and the times in `solver_phases`, must be bitwise identical. A
+step's time must match the published one within a factor of MAX_SECONDS_RATIO. The ratio of the two solvers' times is
+compared step by step (`springbench.harness.results.bootstrap_statistics.estimate_slowdown`). It must match within
+MAX_RATIO_SAME_MACHINE on the published machine type, and within OTHER_MACHINE_FACTOR on others. With another machine,
+or other libraries, source code or numbers of threads, a difference is inconclusive. So is a run that no config
+requests.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import json
 import math
 import os
 import random
+import re
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -38,6 +40,7 @@ from springbench.harness.results import bootstrap_statistics, parquet_rows, row_
 from springbench.harness.results.folder_ownership import read_owner
 from springbench.harness.results.published_set import QUICK_SHARE, compute_file_digest
 from springbench.harness.results.solver_metadata import read_solver_metadata
+from springbench.harness.results.solver_phases import SECONDS_PATTERN
 from springbench.harness.results.time_ratios import OTHER_MACHINE_FACTOR
 
 MAX_RATIO_SAME_MACHINE, MAX_SECONDS_RATIO = 1.25, 3.0
@@ -412,6 +415,12 @@ def _row_key(row: ResultRow) -> tuple[Any, ...]:
     return row["phase"], row["frame"], row["round"]
 
 
+def _get_confirmable(row: ResultRow, name: str) -> Any:
+    """Return the value of a column, for `solver_phases` without the times."""
+    value = row[name]
+    return re.sub(SECONDS_PATTERN, "", value) if name == "solver_phases" and value else value
+
+
 def _find_differences(
     pairs: Sequence[tuple[ResultRow, ResultRow]], names: Iterable[str]
 ) -> dict[str, tuple[ResultRow, Any, Any]]:
@@ -419,7 +428,7 @@ def _find_differences(
     wrong: dict[str, tuple[ResultRow, Any, Any]] = {}
     for row, here in pairs:
         for name in names:
-            was, now = row[name], here[name]
+            was, now = _get_confirmable(row, name), _get_confirmable(here, name)
             if was is not None and was != now and not (was != was and now != now):  # NaN equals NaN here
                 wrong.setdefault(name, (row, was, now))
     return wrong

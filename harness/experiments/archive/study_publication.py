@@ -24,6 +24,7 @@ from springbench.harness.config.config_loader import load_config
 from springbench.harness.errors import InputError, InputMistake
 from springbench.harness.experiments.archive.compaction import TABLE_FOLDERS
 from springbench.harness.results import parquet_rows, published_set, row_store, run_schema
+from springbench.harness.results.solver_phases import SECONDS_PATTERN
 
 DROPPED_COLUMNS = frozenset(
     (
@@ -251,9 +252,20 @@ def _ran_alone(rows: pa.Table) -> bool:
 
 
 def _drop_columns(rows: pa.Table, names: frozenset[str]) -> pa.Table:
-    """Return the table without columns of these names and without empty columns."""
+    """Return the table without columns of these names and empty ones; without `seconds`, no phases have times."""
+    rows = _omit_phase_times(rows) if "seconds" in names else rows
     selected = [name for name in rows.column_names if name not in names and rows[name].null_count < len(rows)]
     return rows.select(selected)
+
+
+def _omit_phase_times(rows: pa.Table) -> pa.Table:
+    """Return the table with iterations and shares of the cost alone in `solver_phases`, if it has that column."""
+    place = rows.schema.get_field_index("solver_phases")
+    if place < 0:
+        return rows
+    return rows.set_column(
+        place, "solver_phases", pc.replace_substring_regex(rows["solver_phases"], SECONDS_PATTERN, "")
+    )
 
 
 _PROVENANCE_COLUMNS = (

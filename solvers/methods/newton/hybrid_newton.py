@@ -28,7 +28,8 @@ multiple of inertia that has a factor (`springbench.solvers.methods.newton.inert
 (`springbench.solvers.methods.newton.hessian_regularisation`), whichever decreased the objective more per factorisation
 when last used. Costs are counted, not measured by a clock: in groups of L-BFGS iterations, from the numbers of springs,
 entries and operations of the factors and from the factorisations made. So equal solves make equal decisions and have
-bitwise equal results, on any machine and under any load. `Solution.solver_phases` explains them.
+bitwise equal results, on any machine and under any load. `Solution.solver_phases` explains them; its times are read
+from the caller's clock where the method changes, and decide nothing.
 
 If a point that satisfies the tolerance has an indefinite Hessian, the step leaves along a direction of negative
 curvature: symmetric initial guesses lead to saddles.
@@ -60,6 +61,7 @@ from springbench.solvers.iteration.descent_method import (
 )
 from springbench.solvers.iteration.idle_contact import skip_idle_contact
 from springbench.solvers.iteration.iterative_solver import SolverState
+from springbench.solvers.iteration.phase_clock import get_phase_clock
 from springbench.solvers.iteration.saddle_check import SaddleCheck
 from springbench.solvers.iteration.solver_info import Citation, SolverInfo
 from springbench.solvers.kernels.descent_rounds import GROUP_ITERATIONS, REASON_SWITCH, init_rounds
@@ -228,7 +230,11 @@ class SolveControl:
         must_escape: whether the last point is a saddle point, to be left.
         is_minimum: whether the last point was reached by an unmodified Newton step that agrees with its model.
         residual: residual at the last point [J^(1/2)], None if it is not known.
-        solver_phases: iterations and cost in Newton steps of each method so far.
+        solver_phases: iterations, cost in Newton steps and time [s] of each method before the current phase; the
+            iterations and cost of the current phase are included, its time is not.
+        clock: clock of the phases [s].
+        phase_name: method of the current phase.
+        phase_start: time at which the current phase began [s].
     """
 
     limits: LoopLimits = ONE_ITERATION
@@ -236,7 +242,34 @@ class SolveControl:
     must_escape: bool = False
     is_minimum: bool = False
     residual: float | None = None
-    solver_phases: dict[str, tuple[int, float]] = field(default_factory=dict)
+    solver_phases: dict[str, tuple[int, float, float]] = field(default_factory=dict)
+    clock: Callable[[], float] = field(default_factory=get_phase_clock)
+    phase_name: str = ""
+    phase_start: float = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.phase_start = self.clock()
+
+    def begin_phase(self, name: str) -> None:
+        """Begin the phase of a method, and end that of another one; the clock is read only where the method changes.
+
+        Args:
+            name: name of the method in `solver_phases`.
+        """
+        if name == self.phase_name:
+            return
+        if self.phase_name in self.solver_phases:
+            now, (count, spent, seconds) = self.clock(), self.solver_phases[self.phase_name]
+            self.solver_phases[self.phase_name] = count, spent, seconds + now - self.phase_start
+            self.phase_start = now
+        self.phase_name = name
+
+    def read_phases(self) -> dict[str, tuple[int, float, float]]:
+        """Return `solver_phases` with the time of the current phase until now."""
+        return {
+            name: (count, spent, seconds + (self.clock() - self.phase_start if name == self.phase_name else 0.0))
+            for name, (count, spent, seconds) in self.solver_phases.items()
+        }
 
     def add_phase(self, name: str, num_iterations: int, cost: float) -> None:
         """Record iterations and the cost of a method, and set `num_iterations`.
@@ -246,8 +279,8 @@ class SolveControl:
             num_iterations: iterations that led to the last point.
             cost: cost of these iterations, in Newton steps.
         """
-        count, spent = self.solver_phases.get(name, (0, 0.0))
-        self.solver_phases[name] = count + num_iterations, spent + cost
+        count, spent, seconds = self.solver_phases.get(name, (0, 0.0, 0.0))
+        self.solver_phases[name] = count + num_iterations, spent + cost, seconds
         self.num_iterations = num_iterations
 
 
@@ -321,9 +354,9 @@ class HybridState(SolverState):
         return not control.must_escape
 
     @property
-    def solver_phases(self) -> dict[str, tuple[int, float]]:
-        """Iterations and cost of each method so far."""
-        return self._control.solver_phases
+    def solver_phases(self) -> dict[str, tuple[int, float, float]]:
+        """Iterations, cost in Newton steps and time [s] of each method so far."""
+        return self._control.read_phases()
 
 
 class LbfgsFirstState(HybridState):
@@ -338,7 +371,8 @@ class LbfgsFirstState(HybridState):
     _is_lbfgs_alone = True
 
     def _start_points(self) -> None:
-        """Do nothing; the first round starts the solve."""
+        """Begin the phase of L-BFGS, whose first round starts the solve."""
+        self._control.begin_phase("lbfgs")
 
     def compute_start_residual(self) -> float:
         """Start L-BFGS and return the residual [J^(1/2)] at the initial guess."""
@@ -379,7 +413,7 @@ class LbfgsFirstState(HybridState):
     def _end_lbfgs_alone(self, run: CompiledAccelerationState, residual: float, ended: int) -> None:
         """End the phase of L-BFGS alone, and continue with the choice between the methods."""
         method, control = self._prepared.hybrid_iteration, self._control
-        control.solver_phases, self._is_lbfgs_alone, self._run = dict(self.solver_phases), False, None
+        control.solver_phases, self._is_lbfgs_alone, self._run = self._count_rounds(), False, None
         self._point = DescentPoint(run.positions.copy(), NO_GRADIENT)
         self.positions = self._point.positions
         method_choice = MethodChoice(method, self._step, self._start, run, control, self._rounds, self._point)
@@ -387,12 +421,16 @@ class LbfgsFirstState(HybridState):
         self._points = method.continue_from(self._step, self._point, control, method_choice)
 
     @property
-    def solver_phases(self) -> dict[str, tuple[int, float]]:
-        """Iterations and cost of each method so far."""
-        if not self._is_lbfgs_alone:
-            return self._control.solver_phases
+    def solver_phases(self) -> dict[str, tuple[int, float, float]]:
+        """Iterations, cost in Newton steps and time [s] of each method so far."""
+        if self._is_lbfgs_alone:
+            self._control.solver_phases = self._count_rounds()
+        return self._control.read_phases()
+
+    def _count_rounds(self) -> dict[str, tuple[int, float, float]]:
+        """Count the iterations and the cost of L-BFGS alone."""
         groups = int(self._rounds["num_iterations"][0]) / GROUP_ITERATIONS if self._num_rounds else 0.0
-        return {"lbfgs": (self._num_rounds, groups / self._prepared.hybrid_iteration.newton_cost)}
+        return {"lbfgs": (self._num_rounds, groups / self._prepared.hybrid_iteration.newton_cost, 0.0)}
 
 
 def limit_rounds(limits: LoopLimits, floor: float) -> LoopLimits:
@@ -573,6 +611,7 @@ class HybridIteration:
                         break
                 if point and (point.is_past_saddle or point.is_stalled):
                     continue
+            control.begin_phase("newton")
             before = self.factor.num_factorisations
             for following in self.newton.iterate_points(step, point or DescentPoint(p, step.gradient(p))):
                 moved, done = following.positions is not p, self.factor.num_factorisations
@@ -683,6 +722,7 @@ class MethodChoice:
                 if name != self._name:
                     self._name = name
                     self._recent_steps.clear()
+                self._control.begin_phase(name)
                 if name == "lbfgs":
                     point = self._run_lbfgs()
                 else:
@@ -820,6 +860,7 @@ class MethodChoice:
         hessian = step.hessian(at.positions)
         if not hessian.factorise(0.0):
             return None
+        self._control.begin_phase("escape")
         before = self._method.factor.num_factorisations
         found = probe_negative_curvature(step, at, hessian, diagonal) or escape_saddle(step, at, hessian, diagonal)
         self._control.add_phase("escape", 1, self._method.factor.num_factorisations - before)
