@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager, ExitStack, closing
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager, ExitStack, closing, suppress
 from functools import partial
 from importlib import import_module
 from pathlib import Path
@@ -28,6 +29,8 @@ from springbench.harness.experiments.kernel_precompilation import compile_missin
 from springbench.harness.experiments.run_unit import RunUnit
 from springbench.harness.experiments.sweep_plan import REQUIRED_COLUMNS, RunFiles, find_stale_run_ids, plan_runs
 from springbench.harness.results import parquet_rows
+from springbench.harness.scenes.scene_builder import build_scene
+from springbench.harness.simulation.direct_solve_remarks import describe_inaccurate_solvers, solves_with_system_matrix
 from springbench.solvers.plugins.plugin_discovery import PluginName, load_target
 from springbench.solvers.registry import SOLVER_TABLE
 
@@ -160,6 +163,8 @@ def run_sweep(
                 load_target(SOLVER_TABLE[solver])
             if isolated:
                 compile_missing_kernels({p.run.solver.name for p in todo}, print_message)
+        for remark in describe_inaccurate_runs([p.run for p in todo]):
+            print_message(remark)
         many = min(execution.num_workers or choose_num_workers(), max(1, len(todo)))
         units = [RunUnit(p.run, p.files, positions, 1 if p.run.timing == "exclusive" else many) for p in todo]
         if away:
@@ -199,6 +204,27 @@ def run_sweep(
                 f"the process that draws {lost}; measured results remain, and the same command draws them"
             ) from None
     return SweepResults(table, stale_ids)
+
+
+def describe_inaccurate_runs(runs: Iterable[RunSpec]) -> Iterator[str]:
+    """Describe the solvers that keep few digits of the positions, for each scene at the smallest of its sizes.
+
+    Args:
+        runs: runs that are about to start; those with user code are ignored.
+
+    Yields:
+        A line for a scene and time step, with the solvers, the cause and a remedy.
+    """
+    concerned: dict[tuple[str, float], list[RunSpec]] = defaultdict(list)
+    for run in runs:
+        if not run.find_plugins() and solves_with_system_matrix(run.solver.name, run.solver.parameters):
+            concerned[run.scene_name, run.scene.time_step].append(run)
+    for (name, _), some in concerned.items():
+        least = min(some, key=lambda run: run.size)
+        with suppress(InputError):  # the run reports it
+            scene = build_scene(least.scene, least.size, least.integrator, log_warnings=False)
+            if remark := describe_inaccurate_solvers(scene, dict.fromkeys(run.solver.name for run in some)):
+                yield f"{name}: {remark}"
 
 
 def _preload_drawing() -> None:

@@ -10,19 +10,23 @@ Where lengths are exact, g is the Lagrangian with the tensions that minimise its
 lengths are wrong.
 
 The audit runs in the instrumentation pass, which is not timed. It detects a method that does nothing and reports a zero
-residual. A method whose iterations do not end at the minimum of the step's objective (`is_minimiser = False`, and no
-substepping) is never rejected; its stationarity is measured all the same.
+residual. If the bound of a solve's rounding errors is as large as the measured residual, the error names them as the
+cause (`springbench.harness.simulation.direct_solve_remarks`). A method whose iterations do not end at the minimum of
+the step's objective (`is_minimiser = False`, and no substepping) is never rejected; its stationarity is measured all
+the same.
 """
 
 from __future__ import annotations
 
 from collections.abc import Collection
+from functools import partial
 from itertools import islice
 from typing import Any
 
 import numpy as np
 from springbench.harness.errors import RunFailed
 from springbench.harness.reference.exact_lengths import StationarityEvaluator
+from springbench.harness.simulation.direct_solve_remarks import explain_residual
 from springbench.harness.simulation.solver_contract import DelegatingSolver
 from springbench.solvers.model.rounding_bound import is_gradient_roundoff
 from springbench.solvers.model.step_problem import Positions, PreparedSolver, Solution, Solver, StepProblem, StopRule
@@ -52,7 +56,7 @@ class AuditedSolver(DelegatingSolver):
         own_steps = find_solver_info(type(solver), find_solver_name(solver)).is_substepping
         self._frames, self._done = frames if self._claims or not own_steps else (), 0
         self._begun = -np.inf
-        self._name = type(solver).__name__
+        self._solver, self._name = solver, type(solver).__name__
         self._stationarity = StationarityEvaluator()
         self.found: dict[int, dict[str, Any]] = {}
         """Column `stationarity_audit` of the row of each audited frame."""
@@ -95,12 +99,13 @@ class AuditedSolver(DelegatingSolver):
         if claimed < reached or enough < reached:  # it may be the residual of the iterate before
             before = [self._stationarity(problem, p).stationarity for p in self._find_previous_iterate(problem, found)]
             least = min(reached, *before, np.inf)
+            explain = partial(explain_residual, self._solver, problem.system, found.positions, truth)
             if claimed < least and not is_gradient_roundoff(problem, found.positions, stop.roundoff_floor):
-                raise RunFailed(f"{message}; expected |Q^-1 grad g|_Q, which is {truth:.3g}")
+                raise RunFailed(f"{message}; expected |Q^-1 grad g|_Q, which is {truth:.3g}{explain()}")
             if enough < least:
                 raise RunFailed(
                     f"{message} and the reason `converged`; expected a residual within the tolerance, "
-                    f"but it is {least:.3g} of the initial one"
+                    f"but it is {least:.3g} of the initial one{explain()}"
                 )
         return {"stationarity_audit": reached}
 

@@ -227,14 +227,28 @@ def assemble_system_matrix(system: System, energies: Iterable[ProjectiveEnergy])
         >>> springbench.assemble_system_matrix(system, energies=[]).toarray().tolist()
         [[4.0, 0.0], [0.0, 8.0]]
     """
-    n = system.num_vertices
-    _, vertices, weight = system.penalty_pins
-    diagonal = system.inertia_diagonal + np.bincount(vertices, weight, minlength=n)
-    Q = drop_zeros(
-        reduce(lambda total, share: total + share, stiffness_shares(system, energies), diagonal_matrix(diagonal))
-    )
+    Q = add_stiffness_shares(system, energies)
     require_determined_positions(system, Q)
     return Q
+
+
+def add_stiffness_shares(system: System, energies: Iterable[ProjectiveEnergy]) -> scipy.sparse.csr_array:
+    """Return Q as `assemble_system_matrix` does, also where it does not determine all positions.
+
+    Args:
+        system: the system.
+        energies: its projective energies.
+    """
+    diagonal = compute_anchor_diagonal(system)
+    return drop_zeros(
+        reduce(lambda total, share: total + share, stiffness_shares(system, energies), diagonal_matrix(diagonal))
+    )
+
+
+def compute_anchor_diagonal(system: System) -> FloatArray:
+    """Return the diagonal of inertia and penalty pins (n,) [N/m], which no displacement of all vertices avoids."""
+    _, vertices, weight = system.penalty_pins
+    return system.inertia_diagonal + np.bincount(vertices, weight, minlength=system.num_vertices)
 
 
 def stiffness_shares(system: System, energies: Iterable[ProjectiveEnergy]) -> Iterator[scipy.sparse.csr_array]:

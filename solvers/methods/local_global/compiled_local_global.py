@@ -8,6 +8,7 @@ the intermediate iterates differ.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from math import log10
 from typing import ClassVar
 
 import numpy as np
@@ -18,6 +19,7 @@ from springbench.solvers.kernels.padding_coordinate import PADDING_COORDINATE
 from springbench.solvers.linalg.memory import allocate_aligned
 from springbench.solvers.linalg.solver_selection import LinearSolverName, Precision, build_linear_solver
 from springbench.solvers.methods.local_global.fused_local_global import (
+    MAX_POSITION_LOSS,
     PreparedCompiledLocalGlobal,
     compile_iterations,
 )
@@ -38,6 +40,8 @@ class CompiledLocalGlobal:
 
     is_minimiser: ClassVar[bool] = True
     is_monotone: ClassVar[bool] = True
+    min_direct_digits: ClassVar[float] = -log10(MAX_POSITION_LOSS)
+    """Digits of a spring's length that solves for positions have at least; with fewer, corrections are solved for."""
     solver_info: ClassVar[SolverInfo] = SolverInfo(
         LOCAL_GLOBAL_FAMILY,
         LIU_2013,

@@ -2,9 +2,9 @@
 
 It uses `springbench.solvers.kernels.local_global_iteration` for factors whose panels the kernels can traverse.
 
-The factors are stored as inverses of blocks, whose products have rounding errors of eps cond(Q) |p| (Higham 2002,
-section 14.1), where cond(Q) <= 2 max_i Q_ii / (Q 1)_i, scaled by Q 1. If that exceeds a small fraction of a spring's
-length, because of large stiffness ratios or distant vertices, corrections are solved for, in float64 too.
+The factors are stored as inverses of blocks, whose products have rounding errors of eps cond(Q) |p|
+(`springbench.solvers.model.solve_accuracy`). If that exceeds a small fraction of a spring's length, because of large
+stiffness ratios or distant vertices, corrections are solved for, in float64 too.
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ from springbench.solvers.methods.local_global.elimination_schedule import (
 )
 from springbench.solvers.methods.local_global.prefactored import PreparedLocalGlobal
 from springbench.solvers.model.energies.spring_energy import Springs
-from springbench.solvers.model.rounding_bound import EPS
+from springbench.solvers.model.solve_accuracy import relative_solve_error
 from springbench.solvers.model.step_problem import Positions, ResidualIterate, StepProblem
 from springbench.solvers.objective.spring_form import SpringForm, decompose_energies
 
 IndexArray = NDArray[np.int64]
 FloatArray = NDArray[np.float64]
 
-_MAX_POSITION_LOSS = 1e-3
+MAX_POSITION_LOSS = 1e-3
 """Largest position error by the bound, relative to the median rest length; the bound is about 20 times the error.
 Sheets of 256 vertices a side and 1e5 N/m stay below it by a factor of 100; scenes with stiffness ratios of 1e12 exceed
 it."""
@@ -94,7 +94,7 @@ def _max_direct_coordinate(base: PreparedLocalGlobal, springs: Springs) -> float
     """Return the largest coordinate [m] for which a direct solve has an acceptable position error."""
     lengths = springs.rest_length[springs.rest_length > 0.0]
     return (
-        _MAX_POSITION_LOSS * float(np.median(lengths)) / (2.0 * EPS * base.diagonal_dominance_ratio)
+        MAX_POSITION_LOSS * float(np.median(lengths)) / relative_solve_error(base.diagonal_dominance_ratio)
         if len(lengths)
         else np.inf
     )

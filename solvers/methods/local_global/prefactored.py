@@ -16,6 +16,7 @@ from springbench.solvers.iteration.iterative_solver import IterativeSolver, Solv
 from springbench.solvers.linalg.direct_solvers import DenseCholesky, LinearSolver
 from springbench.solvers.model import system_matrix_assembly
 from springbench.solvers.model.energies.spring_energy import Springs
+from springbench.solvers.model.solve_accuracy import diagonal_dominance_ratio
 from springbench.solvers.model.step_problem import (
     Energy,
     Positions,
@@ -276,16 +277,8 @@ def prepare_local_global(
         choice,
         (lambda problem: _build_local_step(problem.energies)) if lagged else None,
         inner if is_low_precision else None,
-        _diagonal_dominance_ratio(inner),
+        diagonal_dominance_ratio(inner),
     )
-
-
-def _diagonal_dominance_ratio(Q: csr_array) -> float:
-    """Return max_i Q_ii / (Q 1)_i; infinite if a row sum is zero or round-off."""
-    sums, diagonal = Q.sum(axis=1), Q.diagonal()
-    with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
-        found = np.where(sums > 0.0, diagonal / np.maximum(sums, 0.0), np.inf)
-    return float(found.max(initial=1.0))
 
 
 def _build_local_step(energies: Iterable[Energy]) -> LocalStep:
