@@ -18,6 +18,7 @@ from collections.abc import Callable, Generator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from math import inf
+from pkgutil import resolve_name
 from threading import Timer
 from time import process_time
 from typing import Any, BinaryIO
@@ -52,11 +53,23 @@ class SandboxError(Exception):
     """
 
 
-def call_in_sandbox(function: Callable[..., Any], *arguments: Any, limits: CallLimits) -> Any:
+def prepare_call(function: str) -> None:
+    """Start the sandbox, and import a function there while this process continues.
+
+    Args:
+        function: "module:function".
+    """
+    if can_isolate_processes():
+        with suppress(OSError):  # the process has ended, which the call reports
+            _SandboxProcess.get_running().send_message(function)
+
+
+def call_in_sandbox(function: Callable[..., Any] | str, *arguments: Any, limits: CallLimits) -> Any:
     """Call a module-level function in the sandbox, within limits.
 
     Args:
-        function: function of a module; it is pickled by reference.
+        function: function of a module, which is pickled by reference; or "module:function", which this process does
+            not import.
         arguments: positional arguments, which must pickle.
         limits: processor time and memory of this call.
 
@@ -68,7 +81,7 @@ def call_in_sandbox(function: Callable[..., Any], *arguments: Any, limits: CallL
         SandboxError: if the function raises anything else, exceeds a limit, or crashes.
     """
     if not can_isolate_processes():
-        return _call_unlimited(function, arguments)
+        return _call_unlimited(_resolve_function(function), arguments)
     child = _SandboxProcess.get_running()
     try:
         child.send_message((os.getcwd(), function, arguments, limits))
@@ -80,6 +93,10 @@ def call_in_sandbox(function: Callable[..., Any], *arguments: Any, limits: CallL
     if kind == "error":
         raise SandboxError(answer)
     return answer
+
+
+def _resolve_function(function: Callable[..., Any] | str) -> Callable[..., Any]:
+    return resolve_name(function) if isinstance(function, str) else function
 
 
 def _call_unlimited(function: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
@@ -137,7 +154,7 @@ class _SandboxProcess:
         one = cls._instance
         if one is None or one._owner != os.getpid() or one._process.poll() is not None:
             one = cls._instance = cls()
-            atexit.register(one.stop_process)
+            atexit.register(one.kill_process)
         return one
 
     @classmethod
@@ -168,6 +185,12 @@ class _SandboxProcess:
     def _end_at_time_limit(self) -> None:
         self.timed_out = True
         self._process.kill()
+
+    def kill_process(self) -> None:
+        """Kill the subprocess; no call remains to complete."""
+        if self._owner == os.getpid():
+            self._process.kill()
+            self.stop_process()
 
     def stop_process(self) -> int:
         """Stop the subprocess if needed, and return its exit code, negative for a signal."""
@@ -212,11 +235,14 @@ def serve_calls() -> None:
         os.dup2(nowhere, standard)
     while True:
         try:
-            here, function, arguments, limits = _read_message(
-                calls
-            )  # which imports the function's module, without limits
+            message = _read_message(calls)  # which imports the function's module, without limits
         except (EOFError, KeyboardInterrupt):
             return
+        if isinstance(message, str):
+            _resolve_function(message)
+            continue
+        here, function, arguments, limits = message
+        function = _resolve_function(function)
         with suppress(OSError):  # relative paths mean what they mean to the caller
             os.chdir(here)
         _write_message(answers, _run_call(function, arguments, limits))

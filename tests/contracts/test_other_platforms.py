@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 from springbench.harness.execution.isolated_worker import IsolatedWorker, TaskFailure, TaskLimits
-from springbench.harness.execution.sandbox import CallLimits, SandboxError, call_in_sandbox
+from springbench.harness.execution.sandbox import CallLimits, SandboxError, call_in_sandbox, prepare_call
 from springbench.harness.simulation import stopwatch
 from springbench.solvers import platform_calls
 from springbench.solvers.jit import kernel_cache
@@ -104,6 +104,8 @@ def test_a_reader_that_raises_is_reported_as_the_sandbox_does():
     with pytest.raises(SandboxError, match="invalid literal"):
         call_in_sandbox(int, "a", limits=CallLimits(1.0, 2**30))
     assert call_in_sandbox(int, "7", limits=CallLimits(1.0, 2**30)) == 7
+    prepare_call("builtins:int")
+    assert call_in_sandbox("builtins:int", "8", limits=CallLimits(1.0, 2**30)) == 8
 
 
 def test_locks_of_files_always_succeed_without_fcntl(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):

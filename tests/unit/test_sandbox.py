@@ -6,6 +6,7 @@ import ctypes
 import errno
 import os
 import signal
+import subprocess
 import sys
 import time
 from pathlib import Path
@@ -66,6 +67,10 @@ def half(path: Path) -> None:
         raise OSError(errno.ENOSPC, "the disk is full")
 
 
+def list_modules() -> list[str]:
+    return list(sys.modules)
+
+
 def here() -> str:
     return os.getcwd()
 
@@ -100,6 +105,22 @@ def test_a_call_that_waits_is_reported_with_the_limit_of_wall_time():
     with pytest.raises(sandbox.SandboxError, match=r"takes more than 0\.5 s$"):
         sandbox.call_in_sandbox(time.sleep, 60.0, limits=sandbox.CallLimits(0.05, 2**27))
     assert sandbox.call_in_sandbox(double, 21, limits=LIMITS) == 42
+
+
+def test_a_function_given_by_name_is_imported_in_the_sandbox_alone():
+    """Preparation imports it there before the call."""
+    assert "this" not in sys.modules
+    sandbox.prepare_call("this:d")
+    assert "this" in sandbox.call_in_sandbox(list_modules, limits=LIMITS)
+    assert sandbox.call_in_sandbox("this:d.get", "A", limits=LIMITS) == "N"
+    assert "this" not in sys.modules
+
+
+def test_the_end_of_a_process_does_not_wait_for_a_prepared_call(tmp_path: Path):
+    (tmp_path / "slow_import.py").write_text("import time\ntime.sleep(3.0)\nopen('imported', 'w').close()\n")
+    program = "from springbench.harness.execution.sandbox import prepare_call; prepare_call('slow_import:time')"
+    subprocess.run([sys.executable, "-c", program], cwd=tmp_path, check=True)
+    assert not (tmp_path / "imported").exists()
 
 
 def test_a_mistake_comes_with_its_place(tmp_path: Path):
