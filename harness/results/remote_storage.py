@@ -22,14 +22,12 @@ from typing import Any
 
 from springbench.harness.atomic_files import atomic_write, get_user_cache_dir
 from springbench.harness.errors import InputError, InputMistake, RunFailed
+from springbench.harness.results.row_store import TABLE_FOLDERS
 
 _BATCH_SIZE = 500
 """Number of files per transfer."""
 INDEX_FILE = ".place.json"
 """Name of the index file in the local folder."""
-
-ROW_FOLDER_NAMES = ("rows", "accuracy", "ablation")
-"""Names of folders with rows, and stems of packed files."""
 
 
 @dataclass(slots=True)
@@ -180,7 +178,7 @@ def _is_result_file(path: Path) -> bool:
 
 def _is_row_file(name: str) -> bool:
     path = PurePosixPath(name)
-    return path.suffix == ".parquet" and (path.parent.name in ROW_FOLDER_NAMES or path.stem in ROW_FOLDER_NAMES)
+    return path.suffix == ".parquet" and (path.parent.name in TABLE_FOLDERS or path.stem in TABLE_FOLDERS)
 
 
 def _format_error(error: Exception) -> str:

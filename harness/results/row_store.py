@@ -23,6 +23,9 @@ from springbench.harness.errors import InputError, InputMistake
 if TYPE_CHECKING:
     import pyarrow as pa
 
+TABLE_FOLDERS = ("rows", "accuracy", "ablation")
+"""Names of the folders of rows in the results of a sweep, and stems of packed files."""
+
 FILE_COLUMN = "file"
 """Column of a packed file that names the unit."""
 

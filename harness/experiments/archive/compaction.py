@@ -24,9 +24,6 @@ from springbench.harness.errors import InputError, InputMistake
 from springbench.harness.execution import folder_locks
 from springbench.harness.results import parquet_rows, row_store, run_schema
 
-TABLE_FOLDERS = ("rows", "accuracy", "ablation")
-"""Folders of rows in a folder of results."""
-
 _BATCH_SIZE = 2_000
 """Number of units that are in memory at a time."""
 _SECONDS_PER_DAY = 86_400.0
@@ -46,7 +43,7 @@ def compact_results(results: Path, print_message: Callable[[str], None], *, min_
     Raises:
         InputError: there are no rows, a sweep is running, or the schemas of rows do not match.
     """
-    folders = [folder for table in TABLE_FOLDERS for folder in row_store.find_row_folders(results, table)]
+    folders = [folder for table in row_store.TABLE_FOLDERS for folder in row_store.find_row_folders(results, table)]
     if not folders:
         raise InputError(InputMistake("contains no rows; expected a folder of results, or that of a sweep", results))
     count = 0

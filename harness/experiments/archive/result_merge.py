@@ -24,7 +24,7 @@ import pyarrow.parquet as pq
 from springbench.harness.atomic_files import atomic_write
 from springbench.harness.errors import InputError, InputMistake
 from springbench.harness.execution import folder_locks
-from springbench.harness.experiments.archive.compaction import TABLE_FOLDERS, unify_schemas
+from springbench.harness.experiments.archive.compaction import unify_schemas
 from springbench.harness.report.machine_footer import FOOTER_COLUMNS, build_machine_footer
 from springbench.harness.report.results_comparison import PAIRING_COLUMNS
 from springbench.harness.results import parquet_rows, row_store, row_union, run_schema
@@ -61,7 +61,9 @@ def list_sweep_folders(results: Path) -> list[Path]:
     Raises:
         InputError: there are no rows.
     """
-    found = {folder.parent for table in TABLE_FOLDERS for folder in row_store.find_row_folders(results, table)}
+    found = {
+        folder.parent for table in row_store.TABLE_FOLDERS for folder in row_store.find_row_folders(results, table)
+    }
     found = {folder for folder in found if not any(part.startswith(".") for part in folder.relative_to(results).parts)}
     if not found:
         raise InputError(InputMistake("contains no rows; expected a folder of results, or that of a sweep", results))
@@ -92,7 +94,7 @@ def merge_results(sources: Sequence[Path], target: Path, print_message: Callable
         raise InputError("merge: one folder is that of a sweep, another contains several; expected folders of one kind")
     written = known = 0
     for place in {place for _, place in places}:  # schemas that do not match are refused before anything is written
-        for table in TABLE_FOLDERS:
+        for table in row_store.TABLE_FOLDERS:
             folders = [folder / place / table for folder in (target, *sources)]
             schema = run_schema.RUN_SCHEMA if table == "rows" else _EMPTY_SCHEMA
             unify_schemas([unit for folder in folders for unit in row_store.list_units(folder)], schema)
@@ -100,7 +102,7 @@ def merge_results(sources: Sequence[Path], target: Path, print_message: Callable
         home = target / place
         home.mkdir(parents=True, exist_ok=True)
         with folder_locks.lock_folder_exclusive(home):
-            for table in TABLE_FOLDERS:
+            for table in row_store.TABLE_FOLDERS:
                 found = [source / place / table for source in sources if (source, place) in places]
                 count = _merge_table([folder for folder in found if row_store.list_units(folder)], home / table)
                 written, known = written + count[0], known + count[1]

@@ -22,7 +22,6 @@ import pyarrow.parquet as pq
 from springbench.harness.atomic_files import atomic_write, explain_unreadable_file
 from springbench.harness.config.config_loader import load_config
 from springbench.harness.errors import InputError, InputMistake
-from springbench.harness.experiments.archive.compaction import TABLE_FOLDERS
 from springbench.harness.results import parquet_rows, published_set, row_store, run_schema
 from springbench.harness.results.solver_phases import SECONDS_PATTERN
 
@@ -75,7 +74,7 @@ def write_study(
     made = _read_measurements(provenance) if provenance else None
     found = {
         table: _drop_missing_software(_join_newest_runs(several))
-        for table in ("measurements", *TABLE_FOLDERS)
+        for table in ("measurements", *row_store.TABLE_FOLDERS)
         if (several := [tables[table] for tables in by_part if table in tables])
     }
     if not found:
@@ -184,7 +183,7 @@ def _read_part(part: Path) -> dict[str, pa.Table]:
     if (part / published_set.STUDY_FILE).is_file():
         with published_set.open_study_folder(published_set.read_study(part)) as folder:
             return _read_part(folder)
-    return {table: rows for table in TABLE_FOLDERS if (rows := _read_table(part / table)) is not None}
+    return {table: rows for table in row_store.TABLE_FOLDERS if (rows := _read_table(part / table)) is not None}
 
 
 def _join_newest_runs(parts: Sequence[pa.Table]) -> pa.Table:
