@@ -88,10 +88,11 @@ def _read_packed_units(path: Path, *state: int) -> frozenset[str]:
         if not path.is_file():
             raise OSError("it is no plain file")
         with path.open("rb") as file:  # pyarrow interprets some paths as URLs, and rejects paths that are not UTF-8
-            names = pq.read_table(file, columns=[FILE_COLUMN], partitioning=None)[FILE_COLUMN]
+            column = [FILE_COLUMN]
+            names = pq.ParquetFile(file, read_dictionary=column).read(column)[FILE_COLUMN]
         if names.null_count:
             raise OSError(f"rows without a {FILE_COLUMN}")
-        found = frozenset(map(str, names.cast(pa.string()).unique().to_pylist()))
+        found = frozenset(map(str, names.unify_dictionaries().unique().cast(pa.string()).to_pylist()))
         if foreign := [name for name in found if not is_file_name(name) or name.startswith(".")]:
             raise OSError(f"{foreign[0]!r} is the name of no unit")
         return found
