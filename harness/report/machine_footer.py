@@ -7,9 +7,10 @@ kind.
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import TYPE_CHECKING
 
-import pyarrow as pa
-from springbench.harness.report.table_queries import query_table
+if TYPE_CHECKING:
+    import pyarrow as pa
 
 COMPARISON_NOTE = (
     "compare times only on one machine; across machines compare ratios of such times, iterations, residuals and errors"
@@ -44,6 +45,8 @@ def build_machine_footer(table: pa.Table) -> list[str]:
 
     They list its machines, and which numbers may be compared.
     """
+    from springbench.harness.report.table_queries import query_table
+
     able = ", ".join(f'any_value("{name}")' for name in MACHINE_COLUMNS)
     found = query_table(
         f"select machine_id, node_id, {able} from rows_of where machine_id is not null group by all", table
