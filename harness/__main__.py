@@ -21,9 +21,12 @@ def main() -> None:
         _prepare_environment()
         if len(sys.argv) > 1:
             show_activity("loading")
-        from springbench.harness.cli.main import main as run_command
+        from springbench.harness.cli.early_start import start_early
 
-        run_command()
+        if not start_early(sys.argv[1:]):
+            from springbench.harness.cli.main import main as run_command
+
+            run_command()
     except BaseException as end:
         # After Ctrl-C, clean-up code may raise anything, and Typer turns a KeyboardInterrupt into an exit code.
         if interrupts.is_interrupted() or isinstance(end, KeyboardInterrupt):
@@ -34,7 +37,7 @@ def main() -> None:
 
 
 def _prepare_environment() -> None:
-    """Override environment settings that no command can use.
+    """Set the environment of all commands, and override settings that none can use.
 
     Exit with code 2 for an invalid one.
     """
@@ -43,6 +46,7 @@ def _prepare_environment() -> None:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):  # what a terminal cannot write is written as an escape sequence
             stream.reconfigure(errors="backslashreplace")
+    os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")  # else it searches all packages for them
     os.environ["MPLBACKEND"] = "agg"  # all pictures go to files
     pandas_deferral.request_deferral()
     threads = os.environ.get("NUMBA_NUM_THREADS") or "1"

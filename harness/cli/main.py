@@ -6,8 +6,6 @@ test, 130 stopped by Ctrl-C.
 
 from __future__ import annotations
 
-import json
-import os
 import sys
 from copy import copy
 from importlib import import_module
@@ -323,6 +321,7 @@ def query(
     from springbench.harness.report.machine_footer import COMPARISON_NOTE
     from springbench.harness.report.sql_query import MANY_FILES, MAX_CSV_ROWS, MAX_SHOWN_ROWS, run_query
 
+    console = get_output_console()  # imports Rich while the process of the query starts
     found = run_query(sql, results, max_rows=MAX_CSV_ROWS if csv else MAX_SHOWN_ROWS, cpu_seconds=cpu_limit)
     if found.is_truncated:
         more = "" if csv else "; --csv prints more"
@@ -332,22 +331,16 @@ def query(
     if csv:
         found.write_csv(sys.stdout)
     else:
-        get_output_console().print(found.build_table())
-        get_output_console().print(f"columns machine and node: {COMPARISON_NOTE}")
+        console.print(found.build_table())
+        console.print(f"columns machine and node: {COMPARISON_NOTE}")
 
 
 @app.command()
 def schema() -> None:
     """Print the JSON Schema of scenes and sweeps."""
-    from springbench.harness.execution.source_cache import read_cached_text
+    from springbench.harness.cli.source_texts import print_schema
 
-    print(read_cached_text("schema", _build_schema_text))
-
-
-def _build_schema_text() -> str:
-    from springbench.harness.config.json_schema import build_json_schema as config_schema
-
-    return json.dumps(config_schema(), indent=2)
+    print_schema()
 
 
 @app.command()
@@ -388,7 +381,6 @@ def view(recordings: RecordingsArgument) -> None:
 
 def main() -> None:
     """Run the command that the arguments name."""
-    os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")  # else it searches all packages for them
     # Typer builds the parsers of all registered commands, which takes a tenth of the time of `list`.
     one = copy(app)
     named = [

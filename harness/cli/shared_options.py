@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import os
-import sys
 from inspect import Parameter, Signature
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from springbench.harness.atomic_files import USER_ERRNOS, describe_os_error
 from springbench.harness.cli import results_location
+from springbench.harness.cli.error_reports import report_errors
 from springbench.harness.config.shipped_configs import locate_config
-from springbench.harness.console import enable_logging, print_message
-from springbench.harness.errors import InputError, SpringbenchError
-from springbench.harness.execution.optional_parts import find_part
+from springbench.harness.errors import InputError
 from typer.core import TyperCommand, TyperGroup
 from typer.main import get_command
 
@@ -78,34 +75,11 @@ def require_output_file(path: Path | None, suffix: str, option: str) -> None:
 
 
 class ErrorReportingGroup(TyperGroup):
-    """Command group that reports expected errors as a message and an exit code.
-
-    These are the project's own errors and those of the system.
-    """
+    """Command group that reports expected errors."""
 
     def invoke(self, ctx: Any) -> Any:
-        enable_logging()
-        try:
+        with report_errors():
             return super().invoke(ctx)
-        except SpringbenchError as error:
-            for mistake in getattr(error, "mistakes", (error,)):
-                print_message(f"springbench: {mistake}")
-            raise typer.Exit(error.exit_code) from error
-        except ModuleNotFoundError as error:
-            part = find_part(error)
-            if part is None:
-                raise
-            print_message(f"springbench: {part.describe_absence()}")
-            raise typer.Exit(InputError.exit_code) from error
-        except BrokenPipeError:  # the reader of the output closed the pipe
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-            raise typer.Exit(1) from None
-        except OSError as error:
-            print_message(f"springbench: {describe_os_error(error)}")
-            raise typer.Exit(2 if error.errno in USER_ERRNOS else 1) from error
-        except MemoryError as error:
-            print_message("springbench: there is not enough memory for this; take a smaller mesh")
-            raise typer.Exit(1) from error
 
 
 def build_command_class(*names: str) -> type[TyperCommand]:

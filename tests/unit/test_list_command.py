@@ -4,7 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
+from springbench.harness.cli import source_texts
+from springbench.harness.cli.early_start import start_early
 from springbench.harness.cli.main import app
+from springbench.harness.errors import InputError
 from springbench.harness.scenes.effects.effect_table import EFFECT_CLASSES
 from springbench.harness.scenes.mesh.mesh_table import MESH_CLASSES
 from springbench.solvers.model.integrators import INTEGRATORS
@@ -37,6 +41,29 @@ def test_everything_that_ships_is_listed_with_a_sentence():
         for name in table:
             (line,) = [line for line in lines if line.startswith(f"  {name} ")]
             assert line.removeprefix(f"  {name}").strip()
+
+
+@pytest.mark.parametrize("command", ["list", "schema"])
+def test_a_command_without_arguments_prints_the_same_before_typer_is_imported(
+    command: str, capsys: pytest.CaptureFixture[str]
+):
+    assert start_early([command])
+    assert capsys.readouterr().out == CliRunner().invoke(app, [command]).stdout
+    assert not start_early([command, "--help"])
+    assert capsys.readouterr() == ("", "")
+
+
+def test_an_early_error_is_reported_as_that_of_a_command(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    def fail(*_: object) -> str:
+        raise InputError("a plug-in is odd")
+
+    monkeypatch.setattr(source_texts, "read_cached_text", fail)
+    with pytest.raises(SystemExit) as early:
+        start_early(["list"])
+    assert early.value.code == CliRunner().invoke(app, ["list"]).exit_code == InputError.exit_code
+    assert capsys.readouterr().err.startswith("springbench: a plug-in is odd")
 
 
 def test_the_version_and_short_help():
