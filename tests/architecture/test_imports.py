@@ -63,7 +63,7 @@ def test_a_command_without_pictures_imports_neither_plotting_nor_recording(
         loads(arguments, tmp_path)  # the first time it reads the sources of solvers, and caches what it finds
     loaded = loads(arguments, tmp_path)
     assert not without & set(loaded)
-    # A module takes a third of a millisecond at the least: there are 188 to help, 700 to list, 1,950 with pictures.
+    # A module takes a third of a millisecond at the least: there are 188 to list names, 216 to help, 370 to query.
     assert len(loaded) < fewer
 
 

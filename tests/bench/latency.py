@@ -115,15 +115,15 @@ LATENCY_ROWS = {
     "again-hybrid": LatencyRow(
         "--rerun of a small run, hybrid", 3.5, _AGAIN_HYBRID, (_AGAIN_HYBRID,), limit=_OF_A_RERUN
     ),
-    "list": LatencyRow("list", 0.3, ("list",), limit="two thirds import Typer and Pydantic"),
-    "schema": LatencyRow("schema", 0.5, ("schema",), limit="two thirds import Typer and Pydantic"),
+    "list": LatencyRow("list", 0.3, ("list",)),
+    "schema": LatencyRow("schema", 0.5, ("schema",)),
     "query": LatencyRow(
         f"query on {NUM_STORED_RUNS:,} runs",
         0.8,
         _QUERY,
         (_SWEEP,),
         prepare=_copy_runs,
-        limit="four fifths the process that reads the rows: 3,000 files, each opened for its schema and for its rows",
+        limit="two thirds DuckDB, which opens 3,000 files of 123 columns one after the other, 0.5 ms each or more",
     ),
     "query-packed": LatencyRow(
         f"the same after `springbench compact` ({NUM_STORED_RUNS:,} runs in one file)",
@@ -131,7 +131,7 @@ LATENCY_ROWS = {
         _QUERY,
         (_SWEEP,),
         prepare=_pack_runs,
-        limit="imports: Typer with Pydantic, DuckDB, PyArrow and Rich, and the start of the process that reads",
+        limit="the process that reads: half of its time imports DuckDB, PyArrow and NumPy",
     ),
     "figure": LatencyRow(
         "figure",
