@@ -207,7 +207,9 @@ def run_sweep(
 
 
 def describe_inaccurate_runs(runs: Iterable[RunSpec]) -> Iterator[str]:
-    """Describe the solvers that keep few digits of the positions, for each scene at the smallest of its sizes.
+    """Describe the solvers that keep few digits of the positions, for each scene.
+
+    The smallest size of a scene is examined.
 
     Args:
         runs: runs that are about to start; those with user code are ignored.

@@ -1,4 +1,4 @@
-"""Remarks on solvers whose solves leave few digits of the positions, before a run and after a failed one.
+"""Remarks on solvers whose solves leave few digits of the positions.
 
 The local-global methods solve Q p = b for positions, with an error that `springbench.solvers.model.solve_accuracy`
 bounds. Newton's method solves for corrections, with gradients that are accurate to the last digits of the springs.
@@ -24,7 +24,7 @@ _REMEDY = "take `newton` or `hybrid`"
 
 
 def describe_inaccurate_solvers(scene: Scene, names: Iterable[str]) -> str:
-    """Describe the accuracy of the solvers that keep few digits of the positions at a scene's start.
+    """Describe the solvers that keep few digits of the positions at the start.
 
     Args:
         scene: the scene.
@@ -57,7 +57,7 @@ def solves_with_system_matrix(name: str, parameters: Mapping[str, Any]) -> bool:
 
 
 def explain_residual(solver: Solver, system: System, p: Positions, residual: float) -> str:
-    """Explain a wrong residual by the rounding errors of the solves, if they may be as large.
+    """Explain a wrong residual by rounding errors that may be as large.
 
     Args:
         solver: solver of the step.
@@ -75,7 +75,7 @@ def explain_residual(solver: Solver, system: System, p: Positions, residual: flo
 
 
 def _solves_for_positions(kind: type, accuracy: SolveAccuracy) -> bool:
-    """Return whether the accuracy is that of a solver: of its own positions, or of its rounded corrections."""
+    """Return whether a solver solves for positions, or for corrections with a rounded factor."""
     if find_solver_info(kind, "").family != LOCAL_GLOBAL_FAMILY:
         return False
     return accuracy.precision != "float64" or accuracy.num_digits >= getattr(kind, "min_direct_digits", 0.0)

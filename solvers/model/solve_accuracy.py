@@ -1,10 +1,10 @@
-"""Accuracy of the global step Q p = b with a factor of Q in floating point.
+"""Accuracy of the global step Q p = b with a factor in floating point.
 
     |dp| <= eps cond |p|,   cond <= 2 max_i Q_ii / (Q 1)_i    over the free rows and columns, scaled by D = diag(Q 1)
 
 A solve by Cholesky factors has a relative error of about eps times the condition number (Higham 2002, Accuracy and
 Stability of Numerical Algorithms, sections 10.1 and 14.1). The rows of the matrix of springs have entries of one sign
-beside the diagonal, and their sums (Q 1)_i are the inertia, the weight of a penalty pin and the stiffness towards exact
+off the diagonal, and their sums (Q 1)_i are the inertia, the weight of a penalty pin and the stiffness towards exact
 pins. By Gershgorin's theorem the eigenvalues of D^-1 Q are then between 1 and 2 max_i Q_ii / (Q 1)_i - 1: the condition
 number is large where a vertex with little inertia has stiff springs and no pin near it. Bending and attachments have
 entries of both signs, for which this is an estimate.
@@ -49,7 +49,7 @@ def relative_solve_error(ratio: float, precision: str = "float64") -> float:
 
 @dataclass(frozen=True, slots=True)
 class SolveAccuracy:
-    """Accuracy of solves for the positions of a system, or for corrections if the factor has a low precision.
+    """Accuracy of solves for positions, or for corrections by a rounded factor.
 
     Attributes:
         condition: bound of the condition number.
@@ -100,7 +100,7 @@ class SolveAccuracy:
 
     @property
     def num_digits(self) -> float:
-        """Digits of a spring's length, or of a correction, that rounding leaves at least; zero for none."""
+        """Least number of digits of a spring's length, or of a correction, after rounding."""
         reach = self.max_coordinate / self.spring_length if self.precision == "float64" else 1.0
         error = self.relative_error * reach
         return max(-log10(error), 0.0) if error > 0.0 else np.inf

@@ -54,8 +54,8 @@ from tests.progress_displays import SilentDisplay
 SCENES = Path(__file__).parents[2] / "configs" / "scenes"
 LIMIT, CERTAIN_FRACTION = 1.3, 0.95
 """Largest accepted ratio of errors, and fraction of the budget below which a median is certainly within it."""
-MAX_TIME_RATIO, MAX_KEPT_TIME_RATIO, MAX_ERROR_RATIO = 2.0, 1.3, 1.2
-"""Largest ratio of time to the budget in the first pass, of a setting that it keeps, and of the error to the least for
+MAX_TIME_RATIO, MAX_CANDIDATE_TIME_RATIO, MAX_ERROR_RATIO = 2.0, 1.3, 1.2
+"""Largest ratio of time to the budget in the first pass, of a candidate after it, and of the error to the least for
 an interleaved setting."""
 NUM_INTERLEAVED = 8
 """Number of settings that are measured interleaved with the recommended one."""
@@ -145,7 +145,7 @@ def screen_settings(
             found.append(one)
             if one.error == BUDGET_REFERENCE_ERROR:
                 break
-    return [one for one in found if one.seconds <= MAX_KEPT_TIME_RATIO * question.budget]
+    return [one for one in found if one.seconds <= MAX_CANDIDATE_TIME_RATIO * question.budget]
 
 
 def measure_interleaved(

@@ -19,6 +19,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from PIL import Image
 from springbench.harness.cli.main import app
+from springbench.harness.config.sweep_config import REPORT_TABLE
 from springbench.harness.report.charts.figure_panels import AxisScale, CurvePlot, CurveSeries
 from springbench.harness.report.figures import figure_kinds
 from springbench.harness.report.figures.figure_files import write_figure
@@ -242,8 +243,8 @@ def test_a_report_from_outside_is_a_kind_if_it_has_panels(
         return [CurvePlot(("mine",), ("rows",), "all", "", *scales, series)]
 
     monkeypatch.setattr(report, "panels", panels, raising=False)
-    monkeypatch.setattr(type(figure_kinds.REPORT_TABLE), "_installed_entry_points", lambda _: {"mine": None})
-    monkeypatch.setattr(type(figure_kinds.REPORT_TABLE), "__getitem__", lambda self, name: "tests:mine")
+    monkeypatch.setattr(type(REPORT_TABLE), "_installed_entry_points", lambda _: {"mine": None})
+    monkeypatch.setattr(type(REPORT_TABLE), "__getitem__", lambda self, name: "tests:mine")
     monkeypatch.setattr(figure_kinds, "load_target", lambda _: report)
     found = figure_kinds.find_figure_kind("mine")
     (entry,) = found.list_panels(results["timing"], lambda _: ())

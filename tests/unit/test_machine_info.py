@@ -201,7 +201,7 @@ def test_the_work_of_this_process_during_the_sample_is_no_load(set_core_loads, m
     assert machine_info.choose_threads("auto").count == 3
 
 
-def test_nobody_waits_for_a_sample_that_started_early_enough(set_core_loads, monkeypatch: pytest.MonkeyPatch):
+def test_a_sample_that_started_early_enough_delays_nothing(set_core_loads, monkeypatch: pytest.MonkeyPatch):
     set_core_loads(0, 0, 0, 0)
     waits = list[float]()
     monkeypatch.setattr(machine_info, "sleep", waits.append)

@@ -94,7 +94,7 @@ def test_no_shipped_scene_is_remarked_on(path: Path):
         ("scales-links-1e12", "dense, sparse: ", "only about 1 digit is certain"),
     ],
 )
-def test_solvers_that_keep_few_digits_are_named_with_others_that_keep_more(name: str, solvers: str, digits: str):
+def test_solvers_with_few_digits_are_named_with_others_that_have_more(name: str, solvers: str, digits: str):
     """Below three digits `numba` solves for corrections, which are as accurate as the gradient."""
     said = describe_inaccurate_solvers(scene_of(f"hard/{name}.yaml"), SOLVERS)
     assert said.startswith(f"{solvers}entries of the system matrix have mixed scales")

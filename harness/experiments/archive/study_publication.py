@@ -251,14 +251,17 @@ def _ran_alone(rows: pa.Table) -> bool:
 
 
 def _drop_columns(rows: pa.Table, names: frozenset[str]) -> pa.Table:
-    """Return the table without columns of these names and empty ones; without `seconds`, no phases have times."""
+    """Return the table without empty columns and those of these names.
+
+    Without `seconds`, `solver_phases` has no times.
+    """
     rows = _omit_phase_times(rows) if "seconds" in names else rows
     selected = [name for name in rows.column_names if name not in names and rows[name].null_count < len(rows)]
     return rows.select(selected)
 
 
 def _omit_phase_times(rows: pa.Table) -> pa.Table:
-    """Return the table with iterations and shares of the cost alone in `solver_phases`, if it has that column."""
+    """Return the table without the times in `solver_phases`."""
     place = rows.schema.get_field_index("solver_phases")
     if place < 0:
         return rows

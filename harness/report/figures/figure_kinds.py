@@ -2,31 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from functools import partial
 from importlib import import_module
 from itertools import groupby
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-from springbench.harness.config.sweep_config import REPORT_TABLE
 from springbench.harness.errors import InputError, InputMistake, RunFailed, SpringbenchError, format_allowed_names
-from springbench.harness.report.ablation_summary import read_ablations
-from springbench.harness.report.accuracy.accuracy_reader import read_accuracy
-from springbench.harness.report.change_detection import MIN_RESULTS, find_stored_files, read_histories
-from springbench.harness.report.charts.ablation_charts import build_effect_chart, build_overhead_chart
-from springbench.harness.report.charts.benchmark_chart import RATIO_CHART, TIME_CHART, build_benchmark_chart
 from springbench.harness.report.charts.chart_description import ChartDescription, select_curve_plots, select_panels
-from springbench.harness.report.charts.chart_table import build_compared_chart
-from springbench.harness.report.charts.device_chart import build_device_chart
 from springbench.harness.report.charts.figure_panels import CellMap, FigurePanel, MeshPicture, merge_cell_maps
-from springbench.harness.report.charts.hard_case_chart import build_hard_case_chart
-from springbench.harness.report.device_speedup import read_device_runs
-from springbench.harness.report.figures import timing_panels
 from springbench.harness.report.figures.panel_selection import PanelEntry, entries_from_panels
-from springbench.harness.report.provenance_words import PROVENANCE_COLUMNS, describe_provenance
-from springbench.harness.report.robustness import read_verified_runs
 from springbench.solvers.plugins.plugin_discovery import load_target
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+# What reads results and builds charts is imported where it is called: a kind needs a few modules of a hundred.
+
+StaleFinder = Callable[["pa.Table"], Collection[str]]
+"""Returns the ids of the runs in a table of rows that were measured by other code than the current version."""
 
 
 class FigureKind(NamedTuple):
@@ -42,16 +37,22 @@ class FigureKind(NamedTuple):
 
     title: str
     required_rows: str
-    list_panels: Callable[[Path, timing_panels.StaleFinder], list[PanelEntry]]
+    list_panels: Callable[[Path, StaleFinder], list[PanelEntry]]
     default_panels: tuple[tuple[str, ...], ...] = ((),)
     prepare_panels: Callable[[Sequence[PanelEntry]], list[FigurePanel]] = lambda entries: [
         entry.build_panel() for entry in entries
     ]
 
 
-def _list_mesh_panels(function: str) -> Callable[[Path, timing_panels.StaleFinder], list[PanelEntry]]:
-    """Return a function of `mesh_panels`, which is imported on the first call: it needs PyVista."""
-    return _without_stale(lambda folder: getattr(import_module(_MESH_PANELS), function)(folder))
+def _list_from(module: str, function: str) -> Callable[[Path], list[PanelEntry]]:
+    """Return a function of a module of figures, which is imported on the first call."""
+    return lambda folder: getattr(import_module(f"springbench.harness.report.figures.{module}"), function)(folder)
+
+
+def _list_timing_panels(folder: Path, find_stale: StaleFinder) -> list[PanelEntry]:
+    from springbench.harness.report.figures.timing_panels import list_timing_panels
+
+    return list_timing_panels(folder, find_stale)
 
 
 def _align_mesh_pictures(entries: Sequence[PanelEntry]) -> list[FigurePanel]:
@@ -85,38 +86,60 @@ def _merge_cell_maps(entries: Sequence[PanelEntry]) -> list[FigurePanel]:
 
 def _without_stale(
     panels: Callable[[Path], list[PanelEntry]],
-) -> Callable[[Path, timing_panels.StaleFinder], list[PanelEntry]]:
-    def read(folder: Path, older: timing_panels.StaleFinder) -> list[PanelEntry]:
+) -> Callable[[Path, StaleFinder], list[PanelEntry]]:
+    def read(folder: Path, older: StaleFinder) -> list[PanelEntry]:
         return panels(folder)
 
     return read
 
 
-def _list_accuracy_panels(name: str) -> Callable[[Path, timing_panels.StaleFinder], list[PanelEntry]]:
+def _list_accuracy_panels(name: str) -> Callable[[Path, StaleFinder], list[PanelEntry]]:
     """Return a function that lists the panels of a chart of an accuracy measurement."""
-    return _list_chart_panels(lambda folder: build_compared_chart(name, read_accuracy(folder)))
+
+    def build_chart(folder: Path) -> ChartDescription:
+        from springbench.harness.report.accuracy.accuracy_reader import read_accuracy
+        from springbench.harness.report.charts.chart_table import build_compared_chart
+
+        return build_compared_chart(name, read_accuracy(folder))
+
+    return _list_chart_panels(build_chart)
 
 
 def _list_chart_panels(
     build_chart: Callable[[Path], ChartDescription],
-) -> Callable[[Path, timing_panels.StaleFinder], list[PanelEntry]]:
+) -> Callable[[Path, StaleFinder], list[PanelEntry]]:
     return _without_stale(lambda folder: entries_from_panels(select_panels(build_chart(folder))))
 
 
 def _build_effect_chart(folder: Path) -> ChartDescription:
+    from springbench.harness.report.ablation_summary import read_ablations
+    from springbench.harness.report.charts.ablation_charts import build_effect_chart
+
     return build_effect_chart(read_ablations(folder, "ablated"))
 
 
 def _build_overhead_chart(folder: Path) -> ChartDescription:
+    from springbench.harness.report.ablation_summary import read_ablations
+    from springbench.harness.report.charts.ablation_charts import build_overhead_chart
+
     return build_overhead_chart([row for rows in read_ablations(folder, "overhead").values() for row in rows])
 
 
 def _build_device_chart(folder: Path) -> ChartDescription:
-    return build_device_chart(read_device_runs(timing_panels.read_sweep_rows(folder)))
+    from springbench.harness.report.charts.device_chart import build_device_chart
+    from springbench.harness.report.device_speedup import read_device_runs
+    from springbench.harness.report.figures.timing_panels import read_sweep_rows
+
+    return build_device_chart(read_device_runs(read_sweep_rows(folder)))
 
 
-def _list_hard_case_panels(folder: Path, find_stale: timing_panels.StaleFinder) -> list[PanelEntry]:
-    table = timing_panels.read_sweep_rows(folder)
+def _list_hard_case_panels(folder: Path, find_stale: StaleFinder) -> list[PanelEntry]:
+    from springbench.harness.report.charts.hard_case_chart import build_hard_case_chart
+    from springbench.harness.report.figures.timing_panels import read_sweep_rows
+    from springbench.harness.report.provenance_words import PROVENANCE_COLUMNS, describe_provenance
+    from springbench.harness.report.robustness import read_verified_runs
+
+    table = read_sweep_rows(folder)
     provenance = describe_provenance(table.select(PROVENANCE_COLUMNS).to_pylist())
     return entries_from_panels(
         select_panels(build_hard_case_chart(read_verified_runs(folder), find_stale(table), provenance))
@@ -125,15 +148,17 @@ def _list_hard_case_panels(folder: Path, find_stale: timing_panels.StaleFinder) 
 
 def _list_benchmark_panels(folder: Path) -> list[PanelEntry]:
     """Build a panel for each benchmark with enough results, the largest change first."""
+    from springbench.harness.report.change_detection import MIN_RESULTS, find_stored_files, read_histories
+    from springbench.harness.report.charts.benchmark_chart import RATIO_CHART, TIME_CHART, build_benchmark_chart
+
     known = [one for one in read_histories(find_stored_files([folder])) if len(one.points) >= MIN_RESULTS]
     charts = (build_benchmark_chart(RATIO_CHART if one.is_ratio else TIME_CHART, [one]) for one in known)
     return entries_from_panels(plot for chart in charts for plot in select_curve_plots(chart))
 
 
-_MESH_PANELS = "springbench.harness.report.figures.mesh_panels"
 _ACCURACY_ROWS, _SWEEP_ROWS = "rows of `springbench accuracy CONFIG`", "rows of `springbench run CONFIG`"
 _BENCHMARK_RESULTS = (
-    f"{MIN_RESULTS} stored results of a benchmark, by `pytest tests/bench --benchmark-only` at as many commits"
+    "several stored results of a benchmark, by `pytest tests/bench --benchmark-only` at as many commits"
 )
 _GAP_PANELS = (("gap", "time"), ("gap", "iterations"))
 _PROFILE_PANELS = tuple(("performance", gap) for gap in ("1e-1", "1e-3", "1e-6"))
@@ -162,7 +187,7 @@ FIGURE_KINDS: dict[str, FigureKind] = {
         f"{_ACCURACY_ROWS}, of liu2013.yaml",
         _list_accuracy_panels("liu2013"),
     ),
-    "timing": FigureKind("Time a step", _SWEEP_ROWS, timing_panels.list_timing_panels, (("step",), ("prepare",))),
+    "timing": FigureKind("Time a step", _SWEEP_ROWS, _list_timing_panels, (("step",), ("prepare",))),
     "hard": FigureKind(
         "Hard cases",
         f"{_SWEEP_ROWS} with `verify: true`",
@@ -182,7 +207,7 @@ FIGURE_KINDS: dict[str, FigureKind] = {
     "speed": FigureKind(
         "Speed",
         "rows of `springbench roofline CONFIG`",
-        _without_stale(timing_panels.list_speed_panels),
+        _without_stale(_list_from("timing_panels", "list_speed_panels")),
         (("step",), ("global",)),
     ),
     "devices": FigureKind(
@@ -193,19 +218,19 @@ FIGURE_KINDS: dict[str, FigureKind] = {
     "run": FigureKind(
         "The mesh at the end",
         f"{_SWEEP_ROWS} with recordings",
-        _list_mesh_panels("list_last_frame_panels"),
+        _without_stale(_list_from("mesh_panels", "list_last_frame_panels")),
         prepare_panels=_align_mesh_pictures,
     ),
     "comparison": FigureKind(
         "Solvers side by side",
         f"{_SWEEP_ROWS} with recordings",
-        _list_mesh_panels("list_solver_comparison_panels"),
+        _without_stale(_list_from("mesh_panels", "list_solver_comparison_panels")),
         prepare_panels=_align_mesh_pictures,
     ),
     "scenes": FigureKind(
         "Scenes at their end",
         f"{_SWEEP_ROWS} with recordings",
-        _list_mesh_panels("list_scene_panels"),
+        _without_stale(_list_from("mesh_panels", "list_scene_panels")),
         prepare_panels=_prepare_scene_sheet,
     ),
     "history": FigureKind(
@@ -226,6 +251,8 @@ def find_figure_kind(name: str) -> FigureKind:
     """
     if name in FIGURE_KINDS:
         return FIGURE_KINDS[name]
+    from springbench.harness.config.sweep_config import REPORT_TABLE
+
     known = {*FIGURE_KINDS, *(other for other in REPORT_TABLE if other not in REPORT_TABLE.builtin_tables[0])}
     if name not in known:
         raise InputError(InputMistake(f"got {name!r}; expected {format_allowed_names(name, known)}", key="KIND"))
@@ -237,7 +264,9 @@ def find_figure_kind(name: str) -> FigureKind:
 
 
 def _plugin_entries(name: str, report: Any, folder: Path) -> list[PanelEntry]:
-    table = timing_panels.read_sweep_rows(folder)
+    from springbench.harness.report.figures.timing_panels import read_sweep_rows
+
+    table = read_sweep_rows(folder)
     try:
         panels: Iterable[FigurePanel] = report.panels(table)
         return entries_from_panels(panels)

@@ -13,10 +13,9 @@ from matplotlib.transforms import Bbox
 from springbench.harness.errors import InputError, InputMistake
 from springbench.harness.report.figures import figure_files, panel_selection
 from springbench.harness.report.figures.axis_scales import measure_overlap
-from springbench.harness.report.figures.figure_kinds import FigureKind
+from springbench.harness.report.figures.figure_kinds import FigureKind, StaleFinder
 from springbench.harness.report.figures.figure_layout import compose_figure, visible_texts
 from springbench.harness.report.figures.figure_options import MIN_FONT_SIZE, FigureOptions
-from springbench.harness.report.figures.timing_panels import StaleFinder
 
 _MAX_LISTED = 3
 """Maximum number of faults that a message lists."""

@@ -16,9 +16,6 @@ from springbench.harness.report.speed import speed_figures
 from springbench.harness.report.timing_table import read_run_times
 from springbench.harness.results import parquet_rows, row_store
 
-StaleFinder = Callable[[pa.Table], Collection[str]]
-"""Returns the ids of the runs in a table of rows that were measured by other code than the current version."""
-
 _REQUIRED_COLUMNS = ("run_id", "scene", "size", "solver", "phase", "status")
 
 
@@ -37,7 +34,7 @@ def read_sweep_rows(folder: Path) -> pa.Table:
     return table
 
 
-def list_timing_panels(folder: Path, find_stale: StaleFinder) -> list[PanelEntry]:
+def list_timing_panels(folder: Path, find_stale: Callable[[pa.Table], Collection[str]]) -> list[PanelEntry]:
     """Build the panels of a sweep's times, for each scene.
 
     Args:

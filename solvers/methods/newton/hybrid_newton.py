@@ -251,7 +251,9 @@ class SolveControl:
         self.phase_start = self.clock()
 
     def begin_phase(self, name: str) -> None:
-        """Begin the phase of a method, and end that of another one; the clock is read only where the method changes.
+        """Begin the phase of a method, and end that of another one.
+
+        The clock is read only where the method changes.
 
         Args:
             name: name of the method in `solver_phases`.
