@@ -321,6 +321,7 @@ def query(
     from springbench.harness.report.machine_footer import COMPARISON_NOTE
     from springbench.harness.report.sql_query import MANY_FILES, MAX_CSV_ROWS, MAX_SHOWN_ROWS, run_query
 
+    show_activity("executing the query")
     console = get_output_console()  # imports Rich while the process of the query starts
     found = run_query(sql, results, max_rows=MAX_CSV_ROWS if csv else MAX_SHOWN_ROWS, cpu_seconds=cpu_limit)
     if found.is_truncated:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 from springbench.harness.cli.shared_options import SCENE_HELP, describe_config
-from springbench.harness.console import print_message
+from springbench.harness.console import print_message, show_activity
 from springbench.harness.errors import InputError
 from springbench.harness.execution.isolated_call import run_isolated
 
@@ -39,6 +39,7 @@ def matrices(
     if folder.exists() and not folder.is_dir():
         raise InputError(f"--output: got {folder}, a file; expected a folder, which is made if it is missing")
 
+    show_activity("building the matrices")
     from springbench.harness.config.config_loader import load_scene_run
     from springbench.harness.config.user_code import DEFAULT_LOAD_LIMITS
     from springbench.harness.execution.worker_process import TaskLimits

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from springbench.harness.cli.shared_options import require_output_file
-from springbench.harness.console import get_output_console, print_message
+from springbench.harness.console import get_output_console, print_message, show_activity
 from springbench.harness.errors import InputError, InputMistake
 
 if TYPE_CHECKING:
@@ -37,6 +37,7 @@ def mesh(
 ) -> None:
     """Report on a mesh file: contents, extent, parts, seams, face and edge faults, possible selections."""
     require_output_file(output, ".png", "--output")
+    show_activity("reading the mesh")
     from springbench.harness.scenes.mesh.mesh_report import build_mesh_report
 
     given = {"scale": scale, "units": units, "up": up, "weld": weld, "unused": unused, "faces": faces}

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from springbench.harness.console import print_message
+from springbench.harness.console import print_message, show_activity
 
 
 def pages(
@@ -20,6 +20,7 @@ def pages(
 
     The same published set gives the same bytes.
     """
+    show_activity("checking the pages" if check else "making the pages")
     from springbench.harness.report.pages.page_files import check_pages, write_pages
 
     if not check:

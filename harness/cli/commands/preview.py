@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from springbench.harness.cli.shared_options import SCENE_HELP, describe_config, require_output_file
-from springbench.harness.console import print_message
+from springbench.harness.console import print_message, show_activity
 from springbench.harness.execution.isolated_call import run_isolated
 
 if TYPE_CHECKING:
@@ -27,6 +27,7 @@ def preview(
     path = output or Path(f"{scene.stem}.png")
     require_output_file(path, ".png", "--output")
 
+    show_activity("drawing the scene")
     from springbench.harness.config.config_loader import load_scene_run
     from springbench.harness.config.user_code import DEFAULT_LOAD_LIMITS
     from springbench.harness.execution.worker_process import TaskLimits
