@@ -96,7 +96,7 @@ def main() -> None:
             steps = [f"{run.num_iterations / options.frames:.1f}" for run in runs]
             table.add_row(str(size), *(f"{x:.2f}" for x in ratios.values()), " and ".join(each), " and ".join(steps))
     Console(width=120).print(table)
-    publish_rows(options.publish, PRICES, "python -m tests.bench.bending", rows, begin)
+    publish_rows(options.publish, PRICES, rows, begin)
 
 
 if __name__ == "__main__":

@@ -128,7 +128,7 @@ def main() -> None:
         cells = (row.get(name) for name in ("thickness", "friction", "value", "discrete_form", "closed_form"))
         table.add_row(row["quantity"], *("" if cell is None else f"{cell:.5g}" for cell in cells))
     Console(width=120).print(table)
-    publish_rows(options.publish, CONFIG, "python -m tests.bench.contact_physics", rows, begin, is_timed=False)
+    publish_rows(options.publish, CONFIG, rows, begin, is_timed=False)
 
 
 if __name__ == "__main__":

@@ -67,7 +67,7 @@ def main() -> None:
             table.add_row(str(size), *(f"{1e6 * seconds / STOP.max_iterations:.3g}" for seconds in times))
             rows += found
     Console(width=120).print(table)
-    publish_rows(options.publish, SCENE, "python -m tests.bench.cpp_programs", rows, begin)
+    publish_rows(options.publish, SCENE, rows, begin)
 
 
 if __name__ == "__main__":

@@ -195,7 +195,7 @@ def main() -> None:
                         add(shared | {"device": None}, measure_method(solver, name, problem, *stopping))
     for scene in given.scenes:
         Console(width=120).print(build_table([row for row in rows if row["scene"] == scene.stem], scene.stem))
-    publish_rows(given.publish, given.scenes[0], "python -m tests.bench.device", compare_sides(rows), begin)
+    publish_rows(given.publish, given.scenes[0], compare_sides(rows), begin)
 
 
 def compare_sides(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:

@@ -264,7 +264,7 @@ def main() -> None:
     Console(width=150).print(table)
     if rows:
         config = CONFIGS / CLOTHS["cloth, 100,000 N/m, 32"][0]
-        publish_rows(given.publish, config, "python -m tests.bench.duals", rows, begin)
+        publish_rows(given.publish, config, rows, begin)
 
 
 if __name__ == "__main__":

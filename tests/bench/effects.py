@@ -114,10 +114,7 @@ def main() -> None:
                 )
                 rows += found
             Console(width=200).print(table)
-    chosen = f"--sizes {' '.join(map(str, options.sizes))} --effects {' '.join(options.effects)}"
-    if options.contact_sizes:
-        chosen += f" --contact-sizes {' '.join(map(str, options.contact_sizes))}"
-    publish_rows(options.publish, PRICES, f"python -m tests.bench.effects {chosen}", rows, begin)
+    publish_rows(options.publish, PRICES, rows, begin)
 
 
 if __name__ == "__main__":

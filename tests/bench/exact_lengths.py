@@ -185,9 +185,7 @@ def main() -> None:
         tables = measure_pendulum(), measure_stiffness_ratio(), measure_iterations()
     for rows in tables:
         Console(width=120).print(build_table(rows))
-    publish_rows(
-        options.publish, CHAIN, "python -m tests.bench.exact_lengths", [row for rows in tables for row in rows], begin
-    )
+    publish_rows(options.publish, CHAIN, [row for rows in tables for row in rows], begin)
 
 
 if __name__ == "__main__":

@@ -162,7 +162,7 @@ def main() -> None:
             rows.append(measure_size(size, given.rounds))
             table.add_row(*_format_cells(rows[-1]))
     Console(width=120).print(table)
-    publish_rows(given.publish, SCENE, "python -m tests.bench.factor_threads", rows, begin)
+    publish_rows(given.publish, SCENE, rows, begin)
 
 
 if __name__ == "__main__":

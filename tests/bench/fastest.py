@@ -260,11 +260,7 @@ def main() -> None:
     rows = [
         {"solver": given.solver, "measure": given.measure, **asdict(one), "counts": one.is_counted} for one in found
     ]
-    defaults = {name: parser.get_default(name) for name in ("solver", "only", "rounds", "measure")}
-    options = "".join(
-        f" --{name} {getattr(given, name)}" for name in defaults if getattr(given, name) != defaults[name]
-    )
-    publish_rows(given.publish, given.config, f"python -m tests.bench.fastest {given.config}{options}", rows, begin)
+    publish_rows(given.publish, given.config, rows, begin)
 
 
 if __name__ == "__main__":

@@ -200,7 +200,7 @@ def main() -> None:
             rows += measure_solver(solver, options.size, options.block, options.frames, options.rounds)
     Console(width=120).print(build_table(rows))
     config = CONFIGS / "scenes" / "block-drop.yaml"
-    publish_rows(options.publish, config, "python -m tests.bench.half_spaces", rows, begin)
+    publish_rows(options.publish, config, rows, begin)
 
 
 if __name__ == "__main__":

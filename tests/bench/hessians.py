@@ -139,7 +139,7 @@ def main() -> None:
             table.add_row(path.stem, *format_cells(found))
             rows += found
     Console(width=120).print(table)
-    publish_rows(options.publish, CONFIG, "python -m tests.bench.hessians", rows, begin)
+    publish_rows(options.publish, CONFIG, rows, begin)
 
 
 if __name__ == "__main__":

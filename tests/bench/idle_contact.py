@@ -222,7 +222,7 @@ def main() -> None:
     with limit_threads(1):
         rows = [row for name in options.tables for row in TABLES[name](options)]
     config = SCENES / CLOTHS[options.scenes[0]]
-    publish_rows(options.publish, config, "python -m tests.bench.idle_contact", rows, begin)
+    publish_rows(options.publish, config, rows, begin)
 
 
 if __name__ == "__main__":

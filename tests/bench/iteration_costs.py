@@ -94,7 +94,7 @@ def main() -> None:
         iterations = f"{'' if some[0]['is_converged'] else '>'}{count}"
         table.add_row(scene, f"{rtol:g}", name, iterations, f"{1e3 * seconds:.3g}", f"{1e6 * seconds / count:.3g}")
     Console(width=120).print(table)
-    publish_rows(options.publish, CONFIG, "python -m tests.bench.iteration_costs", rows, begin)
+    publish_rows(options.publish, CONFIG, rows, begin)
 
 
 if __name__ == "__main__":

@@ -115,9 +115,7 @@ def main() -> None:
         growth = f"{log(ratio) / log(cost.vertices / base.vertices):.2f}" if base is not cost else ""
         line = f"{title} | {cost.vertices:,} | {cost.prepare_seconds:.2f} | {cost.cpu_seconds:.3g} | {cost.seconds:.3g}"
         print(f"{line} | {cost.num_iterations:.1f} | {cost.residual:.2e} | {cost.peak_gib:.2f} | {growth}", flush=True)
-    command = "python -m tests.bench.large" + (f" {options.config}" if options.config != GROWTH else "")
-    command += f" --last-step --threads {options.threads}" if options.last_step else ""
-    publish_rows(options.publish, options.config, command, rows, begin)
+    publish_rows(options.publish, options.config, rows, begin)
 
 
 if __name__ == "__main__":

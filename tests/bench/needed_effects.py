@@ -90,7 +90,7 @@ def main() -> None:
             table.add_row(row["scene"], str(row["size"]), f"{row['own_error']:.2g}", row["effect"], displacement)
     get_output_console().print(table)
     config = CONFIGS / "scenes" / "hanging-cloth.yaml"
-    publish_rows(options.publish, config, "python -m tests.bench.needed_effects", rows, begin, is_timed=False)
+    publish_rows(options.publish, config, rows, begin, is_timed=False)
 
 
 if __name__ == "__main__":

@@ -301,7 +301,7 @@ def main() -> None:
         parts = ", ".join(f"{name} {share:.0%}" for name, share in sorted(shares.items(), key=lambda one: -one[1]))
         console.print(f"Of Newton-IPC's time: {parts}; the rest is code of this project.")
         rows += found
-    publish_rows(options.publish, CONFIG, "python -m tests.bench.newton_ipc", rows, begin)
+    publish_rows(options.publish, CONFIG, rows, begin)
 
 
 if __name__ == "__main__":

@@ -280,8 +280,7 @@ def main() -> None:
             for row in radii[-len(RADIUS_RATIOS) * len(RADIUS_ITERATIONS) :]:
                 title = f"{name}: radius {row['radius_ratio']:g}, {row['iterations']:.0f} iterations"
                 Console(width=120).print(f"{title}: {row['error_mm']:.3g} mm")
-            config, command = CONFIGS / "contact-accuracy.yaml", "python -m tests.bench.offset_contact"
-            publish_rows(options.publish, config, command, motions + steps + radii, begin)
+            publish_rows(options.publish, CONFIGS / "contact-accuracy.yaml", motions + steps + radii, begin)
 
 
 if __name__ == "__main__":

@@ -136,7 +136,7 @@ def main() -> None:
     console = Console(width=120)
     console.print(orders)
     console.print(parts)
-    publish_rows(given.publish, SCENE, "python -m tests.bench.ordering", rows, begin)
+    publish_rows(given.publish, SCENE, rows, begin)
 
 
 if __name__ == "__main__":

@@ -171,7 +171,7 @@ def main() -> None:
                 f"{size} x {size}: {in_range:,} contacts in range, by ipctk {pairs:,}; {describe_machine().cpu}"
             )
             console.print(table)
-    publish_rows(options.publish, CONFIG, "python -m tests.bench.pairs", rows, begin)
+    publish_rows(options.publish, CONFIG, rows, begin)
 
 
 if __name__ == "__main__":

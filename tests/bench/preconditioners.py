@@ -88,7 +88,7 @@ def main() -> None:
                 table.add_row(path.stem, name, *map(format_counts, found))
                 rows += found
     Console(width=120).print(table)
-    publish_rows(options.publish, CONFIG, "python -m tests.bench.preconditioners", rows, begin, is_timed=False)
+    publish_rows(options.publish, CONFIG, rows, begin, is_timed=False)
 
 
 if __name__ == "__main__":

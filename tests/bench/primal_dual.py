@@ -103,7 +103,7 @@ def main() -> None:
                     for ratio, count in zip(RATIOS, counts, strict=True)
                 ]
             Console(width=120).print(table)
-    publish_rows(options.publish, CHAIN, "python -m tests.bench.primal_dual", rows, begin, is_timed=False)
+    publish_rows(options.publish, CHAIN, rows, begin, is_timed=False)
 
 
 if __name__ == "__main__":

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import shlex
+import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -21,6 +23,13 @@ from springbench.harness.results.published_set import TABLE_FILES, compute_file_
 def describe_provenance() -> dict[str, Any]:
     """Describe machine, commit, date and load of this moment; a script calls it when it begins."""
     return build_provenance_columns() | {"load_average": os.getloadavg()[0]}
+
+
+def describe_command() -> str:
+    """Describe the command of this process, without the files that it writes."""
+    module, words = sys.modules["__main__"].__spec__, iter(sys.argv[1:])
+    arguments = [word for word in words if not (word in ("--publish", "--save") and next(words, ""))]
+    return shlex.join(["python", "-m", module.name if module else Path(sys.argv[0]).stem, *arguments])
 
 
 def publish_tables(
@@ -60,7 +69,6 @@ def publish_tables(
 def publish_rows(
     folder: Path | None,
     config: Path,
-    command: str,
     rows: Sequence[Mapping[str, Any]],
     begin: Mapping[str, Any],
     *,
@@ -71,7 +79,6 @@ def publish_rows(
     Args:
         folder: folder of the study, or None.
         config: config or scene that was measured.
-        command: command that repeats the study.
         rows: one mapping for each measurement; a column that a row lacks is empty in it.
         begin: value of `describe_provenance` when the script began.
         is_timed: whether times are among the results.
@@ -79,4 +86,4 @@ def publish_rows(
     if folder:
         names = dict.fromkeys(name for row in rows for name in row)
         tables = {"measurements": pa.table({name: [row.get(name) for row in rows] for name in names})}
-        publish_tables(folder, config, command, tables, [begin, describe_provenance()], is_timed=is_timed)
+        publish_tables(folder, config, describe_command(), tables, [begin, describe_provenance()], is_timed=is_timed)

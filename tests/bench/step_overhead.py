@@ -106,7 +106,7 @@ def main() -> None:
     get_output_console().print(table)
     over = [row["solver"] for row in rows if row["solve_seconds"] > MIN_SAMPLE_SECONDS]
     get_output_console().print(f"above {1e6 * MIN_SAMPLE_SECONDS:g} microseconds a solve: {', '.join(over) or 'none'}")
-    publish_rows(options.publish, SCENE, "python -m tests.bench.step_overhead", rows, begin)
+    publish_rows(options.publish, SCENE, rows, begin)
 
 
 if __name__ == "__main__":

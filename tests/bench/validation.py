@@ -77,7 +77,7 @@ def main() -> None:
     for row in measure_cases(options.cases):
         print(*(f"{value:.6g}" if isinstance(value, float) else value for value in row.values()), sep=", ", flush=True)
         rows.append(row)
-    publish_rows(options.publish, FABRICS, "python -m tests.bench.validation", rows, begin, is_timed=False)
+    publish_rows(options.publish, FABRICS, rows, begin, is_timed=False)
 
 
 if __name__ == "__main__":

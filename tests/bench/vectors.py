@@ -320,8 +320,7 @@ def main() -> None:
                 rows.append(
                     {"file": file, "kernel": case.name, "size": SIZE, "ratio": median, "low": low, "high": high}
                 )
-    command = " ".join(["python -m tests.bench.vectors", *(options.files if options.files != list(CASES) else ())])
-    publish_rows(options.publish, SHEET_FILE, command, rows, begin)
+    publish_rows(options.publish, SHEET_FILE, rows, begin)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,9 @@
 """Pages are made from the published set: equal data give equal bytes, and anything stale is found."""
 
+import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -109,12 +111,15 @@ def test_units_of_a_newer_part_replace_those_of_the_same_file(tmp_path: Path) ->
     assert len(units) == len(rows) + len(more)
 
 
-def test_rows_of_a_script_are_a_study_with_what_made_them(tmp_path: Path) -> None:
+def test_rows_of_a_script_are_a_study_with_what_made_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    script = SimpleNamespace(__spec__=SimpleNamespace(name="tests.bench.ratios"))
+    monkeypatch.setitem(sys.modules, "__main__", script)
+    monkeypatch.setattr(sys, "argv", ["ratios.py", "--sizes", "8", "--publish", "results/published/ratios", "--all"])
     begin = describe_provenance()
     rows = [{"solver": "newton", "ratio": 1.5}, {"solver": "vbd", "ratio": None, "reason": "not there"}]
-    publish_rows(tmp_path / "ratios", CONFIGS / "speed.yaml", "python -m tests.bench.ratios", rows, begin)
+    publish_rows(tmp_path / "ratios", CONFIGS / "speed.yaml", rows, begin)
     study = read_study(tmp_path / "ratios")
-    assert study.metadata["command"] == "python -m tests.bench.ratios"
+    assert study.metadata["command"] == "python -m tests.bench.ratios --sizes 8 --all"
     assert len(study.metadata["load_average"]) == len(study.metadata["started"]) == 2
     found = PublishedQueries(tmp_path).query_records("SELECT solver, ratio, reason FROM ratios ORDER BY solver")
     assert found == [rows[0] | {"reason": None}, rows[1]]
