@@ -170,6 +170,7 @@ LATENCY_ROWS = {
         0.2,
         (*_IN_PROCESS, "search-alone"),
         value_key="seconds",
+        limit="one half integrates ten methods once, the other estimates how perturbations grow",
     ),
     "chain-motion": LatencyRow(
         "chain of 9, 0.5 s to 1e-4, the chosen motion",
@@ -191,6 +192,7 @@ LATENCY_ROWS = {
         (*_IN_PROCESS, "overhead-share"),
         value_key="share",
         is_long=True,
+        limit="two thirds the untimed second pass and the rows of each run, one third imports",
     ),
     "first-run-numba": LatencyRow(
         "first run, numba",
@@ -217,6 +219,7 @@ LATENCY_ROWS = {
         is_long=True,
         cold="compiled kernels and results",
         environment=_NO_KERNELS,
+        limit="compiles the kernels of ten methods, one after the other",
     ),
     "gates": LatencyRow(
         "the default gates",
