@@ -185,7 +185,7 @@ def test_a_run_enters_few_modules_and_seldom_changes_them(walk: list[Call]):
     ]
     modules = {call.of for call in before}
     assert len(modules) <= 104, "104 when this was counted last, the accuracy of direct solves among them"
-    assert len(before) <= 1665, "1,659 when this was counted last, the accuracy of direct solves among them"
+    assert len(before) <= 1680, "1,668 when this was counted last, the accuracy of direct solves among them"
 
 
 def test_the_specification_of_a_run_passes_few_files_and_seldom_returns_to_one(walk: list[Call]):

@@ -60,7 +60,7 @@ VERIFIED_SCENES = find_scenes("hard", "hard-long", "exact")
 TOUCHING = {"unseen/cloth-over-ball", "unseen/sheets-pressed"}
 """Scenes with contact in folders of scenes without."""
 UNSEEN_SCENES = find_scenes("unseen")
-OTHERS = find_scenes("hessians", "winners") | {
+OTHERS = find_scenes("hessians", "stiff", "winners") | {
     name: path for name, path in UNSEEN_SCENES.items() if name not in TOUCHING
 }
 CONTACT = find_scenes("contact-accuracy", "growth", "hard-touch", "touch") | {

@@ -128,8 +128,8 @@ def test_a_watch_adds_up_what_is_done_within_it_and_nothing_in_between() -> None
         sleep(0.2)
     assert watch.num_entries == 2
     assert watch.wall_seconds >= 0.02
-    # A thread that sleeps takes no CPU time, but for waking up; others of this process may.
-    assert watch.thread_seconds <= 0.001
+    # A thread that sleeps takes hardly any CPU time; others of this process may take some.
+    assert watch.thread_seconds <= 0.5 * watch.wall_seconds
     busy = watch.thread_seconds, max(watch.thread_seconds, watch.process_seconds)
     assert watch.preempted_seconds in [max(0.0, watch.wall_seconds - seconds) for seconds in busy]
 
