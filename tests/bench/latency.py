@@ -242,6 +242,7 @@ LATENCY_ROWS = {
         cold="the clone and its kernels, not the cache of packages",
         value_key="seconds",
         is_long=True,
+        limit="installs packages, then compiles the kernels of three solvers",
     ),
     "tests": LatencyRow(
         "README's second command, the tests alone",

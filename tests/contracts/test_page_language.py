@@ -27,7 +27,17 @@ ROOT = Path(__file__).resolve().parents[2]
 GENERATED_FOLDER = ROOT / "configs" / "reference"
 GUIDES = [ROOT / "configs" / folder for folder in ("howto", "explanation", "tutorials")]
 HIDDEN_FOLDERS = {".venv", ".pytest_cache", "node_modules", ".ipynb_checkpoints"}
-PAGES = sorted(page for page in ROOT.glob("**/*.md") if not HIDDEN_FOLDERS & set(page.relative_to(ROOT).parts))
+SHIPPED_RESULTS = {"findings", "published"}
+
+
+def is_shipped(page: Path) -> bool:
+    """Return whether a page is part of the project: reports of own results, which git ignores, are not."""
+    parts = page.relative_to(ROOT).parts
+    is_own_result = parts[0] == "results" and len(parts) > 2 and parts[1] not in SHIPPED_RESULTS
+    return not HIDDEN_FOLDERS & set(parts) and not is_own_result
+
+
+PAGES = sorted(page for page in ROOT.glob("**/*.md") if is_shipped(page))
 WRITTEN_PAGES = [page for page in PAGES if page.parent != GENERATED_FOLDER]
 """Pages that people write."""
 MAX_PAGE_WORDS = 1500
