@@ -263,6 +263,11 @@ def format_remaining(seconds: float | None) -> str:
     return f"about {seconds:.0f} s left" if seconds < 600 else f"about {seconds / 60:.0f} min left"
 
 
+def append_remaining(line: str, seconds: float | None) -> str:
+    """Append the remaining time to a line of progress, if it is known."""
+    return "; ".join(filter(None, (line, format_remaining(seconds))))
+
+
 def _format_running(going: Sequence[_RunState]) -> str:
     """Describe the first active run and the number of others in one line.
 
@@ -441,9 +446,8 @@ class ProgressLines:
         self._print_line(f"{title}: {outcome}")
 
     def _print_line(self, message: str) -> None:
-        left = format_remaining(self._pace.estimate_seconds(self._going))
-        rest = f"; {left}" if left and self._number < self._runs else ""
-        line = f"[{self._number}/{self._runs}] {message}{rest}"
+        left = self._pace.estimate_seconds(self._going) if self._number < self._runs else None
+        line = append_remaining(f"[{self._number}/{self._runs}] {message}", left)
         self._console.print(line, highlight=False, soft_wrap=True, markup=False)
         self._printed = monotonic()
 

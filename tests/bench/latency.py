@@ -360,25 +360,27 @@ def _find_console_script() -> str:
     return str(Path(sys.executable).with_name("springbench"))
 
 
+def _read_error_control(results: Path) -> tuple[Path, dict[str, Any]]:
+    """Return the only file of rows in a folder of results, and its row of `run --error`."""
+    (path,) = results.glob("*/accuracy/*.parquet")
+    rows = parquet_rows.read_rows([path], pa.schema([])).to_pylist()
+    return path, next(row for row in rows if row["kind"] == "error-control")
+
+
 def measure_chain_motion() -> dict[str, float]:
     """Return the wall time [s] of the motion that `run chain --error 1e-4` chooses."""
     with TemporaryDirectory() as temporary:
         measure_command(_CHAIN, Path(temporary))
-        (path,) = Path(temporary).glob("*/accuracy/*.parquet")
-        rows = parquet_rows.read_rows([path], pa.schema([])).to_pylist()
-    return {"seconds": next(row["seconds"][0] for row in rows if row["kind"] == "error-control")}
+        return {"seconds": _read_error_control(Path(temporary))[1]["seconds"][0]}
 
 
 def measure_search() -> dict[str, float]:
     """Return the wall time [s] of the search of `run --error`, with kernels and references from an earlier one."""
     with TemporaryDirectory() as temporary:
         measure_command(_TO_ERROR, Path(temporary))
-        (path,) = Path(temporary).glob("*/accuracy/*.parquet")
-        path.unlink()
+        _read_error_control(Path(temporary))[0].unlink()
         measure_command((*_TO_ERROR, "--rerun"), Path(temporary))
-        (path,) = Path(temporary).glob("*/accuracy/*.parquet")
-        rows = parquet_rows.read_rows([path], pa.schema([])).to_pylist()
-    return {"seconds": next(row["search_seconds"] for row in rows if row["kind"] == "error-control")}
+        return {"seconds": _read_error_control(Path(temporary))[1]["search_seconds"]}
 
 
 def measure_verlet_substep() -> dict[str, float]:

@@ -27,8 +27,11 @@ def describe_provenance() -> dict[str, Any]:
 
 def describe_command() -> str:
     """Describe the command of this process, without the files that it writes."""
-    module, words = sys.modules["__main__"].__spec__, iter(sys.argv[1:])
-    arguments = [word for word in words if not (word in ("--publish", "--save") and next(words, ""))]
+    module, arguments = sys.modules["__main__"].__spec__, sys.argv[1:]
+    for option in ("--publish", "--save"):
+        if option in arguments:
+            at = arguments.index(option)
+            del arguments[at : at + 2]
     return shlex.join(["python", "-m", module.name if module else Path(sys.argv[0]).stem, *arguments])
 
 

@@ -20,6 +20,7 @@ from matplotlib.lines import Line2D
 from PIL import Image
 from springbench.harness.cli.main import app
 from springbench.harness.config.sweep_config import REPORT_TABLE
+from springbench.harness.report.change_detection import MIN_RESULTS
 from springbench.harness.report.charts.figure_panels import AxisScale, CurvePlot, CurveSeries
 from springbench.harness.report.figures import figure_kinds
 from springbench.harness.report.figures.figure_files import write_figure
@@ -253,6 +254,10 @@ def test_a_report_from_outside_is_a_kind_if_it_has_panels(
     monkeypatch.setattr(report, "panels", lambda rows: 1 / 0)
     with pytest.raises(figure_kinds.RunFailed, match="the report mine failed: ZeroDivisionError"):
         found.list_panels(results["timing"], lambda _: ())
+
+
+def test_the_figure_of_benchmarks_states_how_many_results_it_needs() -> None:
+    assert figure_kinds.FIGURE_KINDS["history"].required_rows.startswith(f"{MIN_RESULTS} stored results")
 
 
 def test_a_hollow_mark_has_its_own_colour() -> None:

@@ -20,7 +20,7 @@ def validate(
 
     The exit code is 1 if the discretisation does not explain the error of a closed form.
     """
-    from springbench.harness.execution.progress_display import UNIT_COST, RemainingTime, format_remaining
+    from springbench.harness.execution.progress_display import UNIT_COST, RemainingTime, append_remaining
     from springbench.harness.experiments.validation.validation_study import (
         UNEXPLAINED,
         list_case_names,
@@ -41,8 +41,7 @@ def validate(
         now = monotonic()
         if began:
             pace.record_run(UNIT_COST, now - began[-1])
-        title = f"[{len(began)}/{len(cases)}] {name}"
-        print_message("; ".join(filter(None, (title, format_remaining(pace.estimate_seconds())))))
+        print_message(append_remaining(f"[{len(began)}/{len(cases)}] {name}", pace.estimate_seconds()))
         began.append(now)
 
     rows = validate_solver(_create_solver(solver), cases, announce_case)

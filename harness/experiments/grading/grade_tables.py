@@ -9,7 +9,7 @@ from time import monotonic
 
 import numpy as np
 from springbench.harness.errors import InputError
-from springbench.harness.execution.progress_display import UNIT_COST, RemainingTime, format_remaining
+from springbench.harness.execution.progress_display import UNIT_COST, RemainingTime, append_remaining
 from springbench.harness.execution.progress_events import ProgressCallback
 from springbench.harness.experiments.grading.grading import PositionGrade, SceneGrader, format_fit
 from springbench.harness.experiments.grading.motion_error import SMALLEST_ERROR
@@ -110,8 +110,7 @@ def grade_folder(
         raise InputError(f"{folder}: has no files of positions and no folders of them")
     rows, pace = list[ClassRow](), RemainingTime([UNIT_COST] * len(paths))
     for name, path in sorted(paths.items()):
-        title = f"[{len(rows)}/{len(paths)}] grading {name}"
-        report_progress("; ".join(filter(None, (title, format_remaining(pace.estimate_seconds())))))
+        report_progress(append_remaining(f"[{len(rows)}/{len(paths)}] grading {name}", pace.estimate_seconds()))
         began = monotonic()
         try:
             rows.append(ClassRow(name, grader.grade_file(path)))

@@ -24,7 +24,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from springbench.harness.execution.progress_display import format_remaining
+from springbench.harness.execution.progress_display import append_remaining
 from springbench.harness.execution.progress_events import ProgressCallback
 from springbench.harness.experiments.grading.spring_terms import build_step_problem
 from springbench.harness.experiments.grading.submission import SubmittedMotion
@@ -126,7 +126,7 @@ class StepAssessor:
             if elapsed > seconds:
                 break
             left = min(seconds - elapsed, elapsed / done * (n - done)) if done else None
-            report_progress("; ".join(filter(None, (f"minimum {done + 1} of {n}", format_remaining(left)))))
+            report_progress(append_remaining(f"minimum {done + 1} of {n}", left))
             verdicts[step] = self._assess_minimum(submission, verdicts[step])
         return list(verdicts.values())
 

@@ -44,15 +44,11 @@ class FigureKind(NamedTuple):
     ]
 
 
-def _list_from(module: str, function: str) -> Callable[[Path], list[PanelEntry]]:
+def _list_from(module: str, function: str) -> Callable[..., list[PanelEntry]]:
     """Return a function of a module of figures, which is imported on the first call."""
-    return lambda folder: getattr(import_module(f"springbench.harness.report.figures.{module}"), function)(folder)
-
-
-def _list_timing_panels(folder: Path, find_stale: StaleFinder) -> list[PanelEntry]:
-    from springbench.harness.report.figures.timing_panels import list_timing_panels
-
-    return list_timing_panels(folder, find_stale)
+    return lambda *arguments: getattr(import_module(f"springbench.harness.report.figures.{module}"), function)(
+        *arguments
+    )
 
 
 def _align_mesh_pictures(entries: Sequence[PanelEntry]) -> list[FigurePanel]:
@@ -157,9 +153,7 @@ def _list_benchmark_panels(folder: Path) -> list[PanelEntry]:
 
 
 _ACCURACY_ROWS, _SWEEP_ROWS = "rows of `springbench accuracy CONFIG`", "rows of `springbench run CONFIG`"
-_BENCHMARK_RESULTS = (
-    "several stored results of a benchmark, by `pytest tests/bench --benchmark-only` at as many commits"
-)
+_BENCHMARK_RESULTS = "6 stored results of a benchmark, by `pytest tests/bench --benchmark-only` at as many commits"
 _GAP_PANELS = (("gap", "time"), ("gap", "iterations"))
 _PROFILE_PANELS = tuple(("performance", gap) for gap in ("1e-1", "1e-3", "1e-6"))
 
@@ -187,7 +181,9 @@ FIGURE_KINDS: dict[str, FigureKind] = {
         f"{_ACCURACY_ROWS}, of liu2013.yaml",
         _list_accuracy_panels("liu2013"),
     ),
-    "timing": FigureKind("Time a step", _SWEEP_ROWS, _list_timing_panels, (("step",), ("prepare",))),
+    "timing": FigureKind(
+        "Time a step", _SWEEP_ROWS, _list_from("timing_panels", "list_timing_panels"), (("step",), ("prepare",))
+    ),
     "hard": FigureKind(
         "Hard cases",
         f"{_SWEEP_ROWS} with `verify: true`",
