@@ -92,6 +92,7 @@ def list_outcomes(study: PublishedStudy) -> Sequence[dict[str, Any]]:
     return [
         {
             "case_name": cell.case,
+            "scene": cell.case.partition(" ")[0],
             "family": cell.case.partition("-")[0],
             "solver": cell.solver,
             "outcome": cell.outcome.label,
