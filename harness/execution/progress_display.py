@@ -264,7 +264,15 @@ def format_remaining(seconds: float | None) -> str:
 
 
 def append_remaining(line: str, seconds: float | None) -> str:
-    """Append the remaining time to a line of progress, if it is known."""
+    """Append the remaining time to a line of progress, if it is known.
+
+    Args:
+        line: Text without the remaining time.
+        seconds: Estimated remaining time in seconds, or None if it is unknown.
+
+    Returns:
+        The line, followed by the remaining time if there is one.
+    """
     return "; ".join(filter(None, (line, format_remaining(seconds))))
 
 
