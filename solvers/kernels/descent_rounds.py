@@ -1,5 +1,7 @@
 """Rounds of a first-order method, ended when Newton's method is predicted to gain more.
 
+After each group of iterations, rounds of sweeps of another first-order method may follow, where there is one.
+
     q = D_k / D_(k-1),   remaining decrease = q D_k + q^2 D_k + ... = D_k q / (1 - q)
     switch if that per cost of a Newton step exceeds q D_k per round, i.e. if  1 / (1 - q) > cost of a Newton step
     unless  log(r_k / limit) / log(r_(k-1) / r_k) <= cost of a Newton step
@@ -42,6 +44,13 @@ PROBE_ITERATIONS = 4
 _FAST_RESIDUAL_RATIO = 0.5
 """Largest ratio of residuals after the very first iterations at which the method is considered suitable."""
 
+_NEAR_FRACTION = 0.01
+"""Largest decrease in a round, as a fraction of that since the start, at which sweeps may follow: far from a minimum
+they lead to other, higher minima more often."""
+
+_SWEEP_RESIDUAL_RATIO = 10.0**-0.25
+"""Largest ratio of residuals at which more sweeps follow: that of a tenth of the objective in two rounds."""
+
 ROUND_STATE_DTYPE = np.dtype(
     [
         ("num_iterations", np.int64),  # since the start
@@ -55,6 +64,11 @@ ROUND_STATE_DTYPE = np.dtype(
         ("trial_iteration", np.float64),  # iterations from which on a prediction counts
         ("newton_cost", np.float64),  # cost of a Newton step in groups
         ("check_cost", np.float64),  # cost of the end of a round in iterations
+        ("sweep_cost", np.int64),  # cost of a round of sweeps in iterations; 0: there are none
+        ("is_sweeping", np.int64),  # whether the next round consists of sweeps
+        ("segment_end", np.int64),  # iterations after which sweeps may follow
+        ("segment_residual", np.float64),  # residual at the last choice [J^(1/2)]; 0: not known
+        ("round_decrease", np.float64),  # decrease of the objective before the round [J]
     ]
 )
 """The state of the rounds of a solve."""
@@ -64,7 +78,20 @@ ROUND_STATE_DTYPE = np.dtype(
 def round_size(now):
     """Return the number of iterations of the next round, up to the next decision."""
     left = (PROBE_ITERATIONS if now.num_iterations < PROBE_ITERATIONS else now.group_end) - now.num_iterations
+    if now.sweep_cost > 0:
+        left = min(left, now.segment_end - now.num_iterations)
     return max(1, min(left, int(0.5 + 2.0 * np.sqrt(2.0 * now.check_cost * now.num_iterations))))
+
+
+@register_jitable(**jit_inner_options)
+def _choose_sweeps(now, decrease, residual):
+    """Decide whether the next round consists of sweeps."""
+    if now.is_sweeping == 1:
+        continues = residual < _SWEEP_RESIDUAL_RATIO * now.segment_residual
+    else:
+        continues = decrease - now.round_decrease <= _NEAR_FRACTION * decrease
+    now.is_sweeping = 1 if continues else 0
+    now.segment_end, now.segment_residual = now.num_iterations + GROUP_ITERATIONS, residual
 
 
 @register_jitable(**jit_inner_options)
@@ -89,7 +116,10 @@ def _assess_round(now, decrease, residual, residual_limit):
 
 
 def build_rounds(
-    run_unchecked: Callable[..., Any], residual: Callable[..., Any], decrease: Callable[..., Any]
+    run_unchecked: Callable[..., Any],
+    residual: Callable[..., Any],
+    decrease: Callable[..., Any],
+    sweep: Callable[..., Any],
 ) -> Callable[..., Any]:
     """Build the loop over rounds of a state.
 
@@ -97,36 +127,49 @@ def build_rounds(
         run_unchecked: function of the state and a number of iterations that does them and returns how many succeeded.
         residual: function of the state that returns the residual [J^(1/2)].
         decrease: function of the state that returns the decrease of the objective since the start [J].
+        sweep: function of the state that does a round of sweeps.
 
     Returns:
         A function (state, rounds, limits), `rounds` of `ROUND_STATE_DTYPE` (1,) and limits in rounds. It returns the
-        number of rounds, the last residual and the termination reason.
+        number of rounds, the last residual and the termination reason. Without a limit of the residual, it is computed
+        only where a decision needs it, and may be nan.
     """
 
     def iterate(state: Any, rounds: Any, limits: Any) -> Any:
         now, count, found, ended = rounds[0], 0, np.nan, REASON_ITERATIONS
         if now.initial_residual < 0.0:
-            now.initial_residual = now.group_residual = residual(state)
+            now.initial_residual = now.group_residual = now.segment_residual = residual(state)
         while ended == REASON_ITERATIONS and count < limits.max_iterations:
-            size = round_size(now)
-            done = run_unchecked(state, size)
-            now.num_iterations += size
             count += 1
-            found = residual(state)
-            ended = check_residual(found, limits)
+            size = now.sweep_cost if now.is_sweeping == 1 else round_size(now)
+            is_done = True
+            if now.is_sweeping == 1:
+                sweep(state)
+            else:
+                is_done = run_unchecked(state, size) == size
+            now.num_iterations += size
+            total = decrease(state)
+            ends_segment = now.sweep_cost > 0 and (now.is_sweeping == 1 or now.num_iterations >= now.segment_end)
+            is_assessed = now.num_iterations == PROBE_ITERATIONS or now.num_iterations >= now.group_end
+            found = np.nan
+            if limits.residual_limit > 0.0 or ends_segment or is_assessed or not is_done:
+                found = residual(state)
+                ended = check_residual(found, limits)
+            if ends_segment:
+                _choose_sweeps(now, total, found)
+            now.round_decrease = total
             if ended == REASON_ITERATIONS:
-                ended = (
-                    _assess_round(now, decrease(state), found, limits.residual_limit)
-                    if done == size
-                    else REASON_STALLED
-                )
+                ended = _assess_round(now, total, found, limits.residual_limit) if is_done else REASON_STALLED
         return count, found, ended
 
     return iterate
 
 
 def build_compiled_rounds(
-    step_state: Callable[..., Any], residual: Callable[..., Any], decrease: Callable[..., Any]
+    step_state: Callable[..., Any],
+    residual: Callable[..., Any],
+    decrease: Callable[..., Any],
+    sweep: Callable[..., Any],
 ) -> Any:
     """Build the loop over rounds for kernels, from inner functions of the state.
 
@@ -134,26 +177,33 @@ def build_compiled_rounds(
         step_state: does an iteration and returns whether it succeeded.
         residual: returns the residual [J^(1/2)].
         decrease: returns the decrease of the objective since the start [J].
+        sweep: does a round of sweeps.
 
     Returns:
         The function of `build_rounds`, compiled.
     """
 
-    return jit_closure(build_rounds(build_unchecked_steps(step_state), residual, decrease))
+    return jit_closure(build_rounds(build_unchecked_steps(step_state), residual, decrease, sweep))
 
 
-def init_rounds(newton_cost: float, check_cost: float) -> Any:
+def init_rounds(newton_cost: float, check_cost: float, sweep_cost: int = 0, *, starts_sweeping: bool = False) -> Any:
     """Return the state of rounds at their start, (1,).
 
     Args:
         newton_cost: cost of a Newton step, in groups.
         check_cost: cost of the end of a round, in iterations.
+        sweep_cost: cost of a round of sweeps, in iterations; 0 for no sweeps.
+        starts_sweeping: whether the first round consists of sweeps.
     """
-    content = _initial_content(newton_cost, check_cost)  # NumPy copies field by field
+    content = _initial_content(newton_cost, check_cost, sweep_cost, starts_sweeping)  # NumPy copies field by field
     return np.frombuffer(bytearray(content), ROUND_STATE_DTYPE)
 
 
 @cache
-def _initial_content(newton_cost: float, check_cost: float) -> bytes:
-    initial = 0, GROUP_ITERATIONS, 0, -1.0, 0.0, 0.0, np.inf, 0.0, 0.0, newton_cost, check_cost
-    return np.array([initial], ROUND_STATE_DTYPE).tobytes()
+def _initial_content(newton_cost: float, check_cost: float, sweep_cost: int, starts_sweeping: bool) -> bytes:
+    initial = np.zeros(1, ROUND_STATE_DTYPE)
+    initial["group_end"] = initial["segment_end"] = GROUP_ITERATIONS
+    initial["initial_residual"], initial["gain"] = -1.0, np.inf
+    initial["newton_cost"], initial["check_cost"] = newton_cost, check_cost
+    initial["sweep_cost"], initial["is_sweeping"] = sweep_cost, starts_sweeping
+    return initial.tobytes()

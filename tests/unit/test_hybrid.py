@@ -24,6 +24,8 @@ from springbench.solvers.methods.newton.inertia_shift import InertiaShift
 from springbench.solvers.methods.newton.negative_curvature import probe_negative_curvature
 from springbench.solvers.methods.newton.newton_direct import NewtonSolver
 from springbench.solvers.methods.quasi_newton.lbfgs import Lbfgs
+from springbench.solvers.methods.quasi_newton.sweep_rounds import ROUND_SWEEPS
+from springbench.solvers.methods.vertex_block.vbd import VertexBlockDescent
 from springbench.solvers.model.step_problem import DirichletPins, Positions, StepProblem, StopRule, System
 from springbench.solvers.objective.fixed_objective import FixedObjective
 from springbench.solvers.objective.step_objective import StepObjective
@@ -112,8 +114,9 @@ def inertial_prediction(given: StepProblem) -> Positions:
 
 
 @pytest.mark.parametrize("guess", ["previous", "solution"])
-def test_soft_springs_are_left_to_lbfgs(guess):
+def test_the_first_group_of_iterations_is_that_of_lbfgs(guess, monkeypatch):
     """Its iterates are some of those of L-BFGS, bit for bit, from the lower one of the guess and the prediction."""
+    monkeypatch.setattr(hybrid_newton, "_SWEEP_FIRST_RATIO", 0.0)
     given = stiff(0.1)
     prepared, lbfgs = HybridNewton().prepare(given.system), Lbfgs().prepare(given.system)
     fall = inertial_prediction(given)
@@ -128,6 +131,65 @@ def test_soft_springs_are_left_to_lbfgs(guess):
         if numbers[-1] == len(path):
             break
     assert {4, 10} <= set(numbers)  # where the rule decides
+
+
+@pytest.mark.parametrize("guess", ["previous", "solution"])
+def test_soft_springs_are_first_left_to_sweeps(guess):
+    """The first iterate is that of as many sweeps, from the lower one of the guess and the prediction."""
+    given = stiff(0.1)
+    prepared, descent = HybridNewton().prepare(given.system), VertexBlockDescent().prepare(given.system)
+    start = fall = inertial_prediction(given)
+    if guess == "solution":
+        start = descent.solve(given, StopRule(4)).positions
+        given = replace(given, initial_guess=start)
+    assert (given.value(fall) < given.value(given.initial_guess)) == (guess == "previous")
+    found = next(prepared.iterates(given))
+    wanted = descent.solve(replace(given, initial_guess=start), StopRule(ROUND_SWEEPS)).positions
+    np.testing.assert_array_equal(found, wanted)
+
+
+def build_rounds_at(**fields):
+    """The state of rounds after a group of ten iterations that decreased the objective by one."""
+    (rounds,) = descent_rounds.init_rounds(4.0, 0.1, 3).view(np.recarray)
+    rounds.num_iterations, rounds.segment_residual = 10, 1.0
+    for name, value in fields.items():
+        setattr(rounds, name, value)
+    return rounds
+
+
+@pytest.mark.parametrize(("last_decrease", "follow"), [(0.011, 0), (0.009, 1)])
+def test_sweeps_follow_iterations_near_the_minimum_only(last_decrease, follow):
+    rounds = build_rounds_at(round_decrease=1.0 - last_decrease)
+    descent_rounds._choose_sweeps(rounds, 1.0, 0.5)
+    assert rounds.is_sweeping == follow
+
+
+@pytest.mark.parametrize(("residual", "follow"), [(0.57, 0), (0.56, 1)])
+def test_more_sweeps_follow_if_two_rounds_reduce_the_objective_to_a_tenth(residual, follow):
+    rounds = build_rounds_at(is_sweeping=1, round_decrease=0.0)
+    descent_rounds._choose_sweeps(rounds, 1.0, residual)
+    assert rounds.is_sweeping == follow
+    assert rounds.segment_end == rounds.num_iterations + descent_rounds.GROUP_ITERATIONS
+
+
+def test_sweeps_help_lbfgs_where_springs_are_compressed(monkeypatch):
+    """A cloth whose edges are moved together by a tenth: a gap of 1e-6 takes fewer iterations and sweeps."""
+    given = stiff(1e3)
+    squeezed = given.current_positions * [0.9, 1.0, 1.0]
+    given = replace(given, initial_guess=squeezed, inertial_target=squeezed, external_force=given.external_force / 10.0)
+    lowest = NewtonSolver().prepare(given.system).solve(given, StopRule(300, 1e-10)).positions
+    counts = []
+    for sweeps in (True, False):
+        prepared = HybridNewton().prepare(given.system)
+        method, start = prepared.hybrid_iteration, given.value(given.initial_guess)
+        if not sweeps:
+            method.sweep_cost = 0
+        run = prepared.init_state(given, given.initial_guess)
+        while given.value(run.positions) - given.value(lowest) > 1e-6 * (start - given.value(lowest)):
+            run.step_state()
+        counts.append(int(run._rounds["num_iterations"][0]))
+    print(counts)
+    assert counts[0] < counts[1]
 
 
 def test_a_solve_by_lbfgs_alone_prepares_nothing_for_the_other_methods(monkeypatch):

@@ -69,7 +69,10 @@ class AcceleratedState(SolverState):
 
 
 _interpreted_rounds = descent_rounds.build_rounds(
-    lambda state, count: state.run_unchecked(count), methodcaller("residual"), attrgetter("objective_decrease")
+    lambda state, count: state.run_unchecked(count),
+    methodcaller("residual"),
+    attrgetter("objective_decrease"),
+    lambda state: None,
 )
 
 

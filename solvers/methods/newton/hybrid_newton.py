@@ -15,7 +15,10 @@ Sorensen 1983).
 
 L-BFGS runs first. If the factor of Q exceeds the cache, it is in float32, unless Q is so stiff that its directions
 would have no digit: the iterations are then limited by memory bandwidth, and directions need no more digits. The start
-is the better of the initial guess and the inertial prediction.
+is the better of the initial guess and the inertial prediction. Near the minimum, where a round of L-BFGS decreases the
+objective by at most a hundredth of the decrease so far, groups of its iterations alternate with rounds of sweeps of
+vertex block descent (`springbench.solvers.methods.quasi_newton.sweep_rounds`), as long as each round of sweeps halves
+the residual or nearly so. If no diagonal entry of Q exceeds the inertia much, the sweeps come first.
 
 One rule decides which of the three methods continues: that with the largest decrease of the objective per cost in its
 last steps. A method that was not yet measured is credited with the decrease that L-BFGS leaves, extrapolated from its
@@ -88,6 +91,7 @@ from springbench.solvers.methods.newton.negative_curvature import (
 from springbench.solvers.methods.newton.newton_direct import NewtonIteration
 from springbench.solvers.methods.newton.predicted_tension import PredictedTensionNewton, compute_objective_decrease
 from springbench.solvers.methods.quasi_newton.lbfgs import Lbfgs
+from springbench.solvers.methods.quasi_newton.sweep_rounds import ROUND_SWEEPS
 from springbench.solvers.methods.quasi_newton.windowed_acceleration import (
     CompiledAccelerationState,
     PreparedAccelerated,
@@ -123,9 +127,14 @@ _MAX_SHIFT = 1e3
 NO_GRADIENT = np.empty((0, 3))
 """Placeholder for the gradient at a point of L-BFGS: the residual there is known, and the gradient is not used."""
 
-_LBFGS_NANOSECONDS, _NEWTON_NANOSECONDS = (1e3, 17.0, 2.0), (2e5, 0.023, 20.0)
-"""Costs of an L-BFGS iteration (constant, per spring, per entry of the factor) and of a Newton step (constant, per
-flop, per entry), fitted to 16 scenes of 6 to 4096 vertices on one core with AVX-512; their ratio alone matters."""
+_LBFGS_NANOSECONDS, _SWEEP_NANOSECONDS, _NEWTON_NANOSECONDS = (1e3, 17.0, 2.0), (5e2, 10.0), (2e5, 0.023, 20.0)
+"""Costs of an L-BFGS iteration (constant, per spring, per entry of the factor), of a sweep (constant, per spring) and
+of a Newton step (constant, per flop, per entry), fitted to 16 scenes of 6 to 4096 vertices on one core with AVX-512;
+their ratio alone matters."""
+
+_SWEEP_FIRST_RATIO = 500.0
+"""Largest ratio of the diagonal of Q to the inertia at which a solve starts with sweeps: Chebyshev's iteration then
+divides the objective by ten in about as many sweeps as a group has iterations."""
 
 _RESIDUAL_COST, _COLLISION_CHECK_COST = 0.1, 20.0
 """Costs of a residual and of a check for collisions, in iterations of L-BFGS: 0.04 to 0.3 on 15 scenes of 9 to 4096
@@ -134,7 +143,7 @@ vertices, and 10 to 100 on folded cloths of 85 to 396 vertices."""
 
 @dataclass(frozen=True)
 class HybridNewton:
-    """L-BFGS far from the minimum, then Newton's method with predicted tensions, then Newton's method."""
+    """L-BFGS and vertex sweeps first, then Newton's method with predicted tensions, then Newton's method."""
 
     is_minimiser: ClassVar[bool] = True
     is_monotone: ClassVar[bool] = True
@@ -147,7 +156,7 @@ class HybridNewton:
             "10.1145/2766969",
         ),
         is_family_default=True,
-        formula="L-BFGS, then Newton with predicted tensions",
+        formula="L-BFGS and sweeps, then Newton with predicted tensions",
         cost="1 L-BFGS iteration or 1 Newton step",
     )
 
@@ -161,7 +170,7 @@ class HybridNewton:
         with cache_symbolic_analysis():
             metric, objective = ResidualMetric(system), FixedObjective(system)
             is_double = metric.stats.get("nnz_factor", np.inf) <= _CACHED_ENTRIES or _needs_double_precision(metric)
-            lbfgs = Lbfgs(precision="float64" if is_double else "float32").prepare_without_barriers(system)
+            lbfgs = Lbfgs(precision="float64" if is_double else "float32").prepare_with_sweeps(system)
             method, factor = HybridIteration(objective, metric, lbfgs, is_double), objective.hessian_matrix.factor
         facts = metric.stats | {"nnz_hessian_factor": float(factor.nonzeros)}
         choice = f"a factor of the Hessian with {factor.nonzeros:,} entries; for L-BFGS, {lbfgs.description}"
@@ -405,7 +414,7 @@ class LbfgsFirstState(HybridState):
             return super()._advance(limits)
         limits = self._one_round if limits is ONE_ITERATION else limit_rounds(limits, self._floor)
         count, residual, ended = run.run_rounds(self._rounds, limits)
-        control.num_iterations, control.residual = count, residual
+        control.num_iterations, control.residual = count, None if np.isnan(residual) else residual
         self._num_rounds += count
         self.positions = run.positions
         if ended in (REASON_STALLED, REASON_SWITCH) or residual <= self._floor:
@@ -532,6 +541,8 @@ class HybridIteration:
         exact_lbfgs: L-BFGS, if its residuals are those of the metric; else None.
         starts_lower: whether L-BFGS itself starts at the lower one of the initial guess and the inertial prediction.
         newton_cost: cost of a Newton step, in groups of L-BFGS iterations.
+        sweep_cost: cost of a round of sweeps, in L-BFGS iterations; 0 if there are none.
+        starts_sweeping: whether a solve starts with sweeps.
     """
 
     can_identify_saddles: ClassVar[bool] = True
@@ -542,9 +553,8 @@ class HybridIteration:
         self.metric, self._lbfgs = metric, lbfgs
         self.newton = NewtonIteration(metric, has_local_roundoff=True)
         self.system_diagonal: NDArray[np.float64] = np.repeat(metric.free_diagonal, 3)
-        self.inertia_diagonal: NDArray[np.float64] = np.repeat(
-            objective.system.inertia_diagonal[objective.system.free_vertices], 3
-        )
+        inertia = objective.system.inertia_diagonal[objective.system.free_vertices]
+        self.inertia_diagonal: NDArray[np.float64] = np.repeat(inertia, 3)
         self.factor = factor = objective.hessian_matrix.factor
         self._system_has_barriers = without_barriers(objective.system) is not objective.system
         is_exact = is_double and not objective.has_barriers
@@ -552,16 +562,22 @@ class HybridIteration:
         self.exact_lbfgs = lbfgs if is_exact else None
         is_projective = objective.projective_indices.issuperset(objective.element_energy_indices)
         self.starts_lower = is_exact and is_projective and lbfgs.can_start_lower
-        constant, per_spring, per_entry = _LBFGS_NANOSECONDS
         springs, entries = len(objective.springs.stiffness), lbfgs.stats.get("nnz_factor", 0.0)
-        lbfgs_cost = GROUP_ITERATIONS * (constant + per_spring * springs + per_entry * entries)
+        constant, per_spring, per_entry = _LBFGS_NANOSECONDS
+        lbfgs_cost = constant + per_spring * springs + per_entry * entries
         constant, per_flop, per_entry = _NEWTON_NANOSECONDS
-        self.newton_cost = (constant + per_flop * factor.flops + per_entry * factor.nonzeros) / lbfgs_cost
+        newton_cost = constant + per_flop * factor.flops + per_entry * factor.nonzeros
+        self.newton_cost = newton_cost / (GROUP_ITERATIONS * lbfgs_cost)
+        constant, per_spring = _SWEEP_NANOSECONDS
+        sweep_cost = ROUND_SWEEPS * (constant + per_spring * springs)
+        has_sweeps = lbfgs.can_start_lower
+        self.sweep_cost = max(1, round(sweep_cost / lbfgs_cost)) if has_sweeps else 0
+        self.starts_sweeping = has_sweeps and bool((metric.free_diagonal <= _SWEEP_FIRST_RATIO * inertia).all())
         self._check_cost = _COLLISION_CHECK_COST if objective.has_barriers else _RESIDUAL_COST
 
     def init_rounds(self) -> NDArray[Any]:
         """Return the state of the rounds of a solve."""
-        return init_rounds(self.newton_cost, self._check_cost)
+        return init_rounds(self.newton_cost, self._check_cost, self.sweep_cost, starts_sweeping=self.starts_sweeping)
 
     def round_off(self, p: Positions) -> float:
         """Return the residual [J^(1/2)] that rounded positions p (n, 3) [m] leave."""
@@ -764,6 +780,8 @@ class MethodChoice:
             self._run = self._method.start_lbfgs(step, self._point.positions)
             rounds["group_start"], rounds["group_end"] = 0.0, rounds["num_iterations"] + GROUP_ITERATIONS
             rounds["gain"], rounds["group_residual"] = np.inf, 0.0
+            rounds["segment_end"], rounds["is_sweeping"] = rounds["group_end"], 0
+            rounds["round_decrease"] = 0.0
         if step.barrier_energies:  # each round is checked for collisions
             limits = limits._replace(max_iterations=1)
         rival_gain = max(self._gains["predicted tensions"], self._gains["newton"])
@@ -772,7 +790,7 @@ class MethodChoice:
         count, residual, ended = self._run.run_rounds(rounds, limit_rounds(limits, self._floor))
         done = int(rounds["num_iterations"][0]) - self._num_lbfgs_iterations
         self._control.add_phase("lbfgs", count, done / GROUP_ITERATIONS / self._method.newton_cost)
-        if self._method.exact_lbfgs:
+        if self._method.exact_lbfgs and not np.isnan(residual):
             point, self._control.residual = DescentPoint(self._run.positions.copy(), NO_GRADIENT), residual
         else:
             point = compute_current_point(self._run)

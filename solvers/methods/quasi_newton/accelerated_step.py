@@ -21,7 +21,6 @@ from springbench.solvers.kernels.accelerated_descent import (
     init_window,
     propose_trial,
 )
-from springbench.solvers.kernels.descent_rounds import build_compiled_rounds
 from springbench.solvers.kernels.iteration_loop import build_compiled_loop
 from springbench.solvers.kernels.local_global_iteration import IterationPlan
 from springbench.solvers.kernels.objective_kernels import predict_positions
@@ -85,7 +84,7 @@ def start_solve(
     rows, size = step.vertex_rows, len(window.direction)
     write_right_hand_side(rows, target, force, pin_targets, step.right_hand_side)
     write_positions(rows, guess, pin_targets, window.trial_position)
-    step.objective_values[0] = _evaluate_trial(step, window)
+    step.objective_values[0] = evaluate_trial(step, window)
     at_guess, is_lower = np.nan, False
     if start == START_LOWER_MEASURED:
         at_guess = _start_window(step, window)
@@ -94,7 +93,7 @@ def start_solve(
             window.position[k], window.descent[k] = window.trial_position[k], window.trial_descent[k]
         predict_positions(rows.inertia_diagonal, target, external_force, rows.pinned_vertices, pin_targets, out)
         write_positions(rows, out, pin_targets, window.trial_position)
-        there = _evaluate_trial(step, window)
+        there = evaluate_trial(step, window)
         is_lower = there < step.objective_values[0]
         if is_lower:
             step.objective_values[0] = there
@@ -114,41 +113,52 @@ def start_solve(
 @jit_inner
 def _start_window(step, window):
     """Start the window at the trial point and return the residual [J^(1/2)] there."""
-    _solve_rows(step.iteration_plan, window.trial_descent, len(window.direction), step.solution_rows)
+    solve_trial(step, window)
     init_window(window, step.solution_rows)
-    return _residual((step, window))
+    return compute_residual((step, window))
 
 
 @jit_inner
-def _step_state(state):
+def step_state(state):
+    """Do one iteration of a state (step, window); return whether a trial was accepted."""
     step, window = state
     now, there, verdict = window.window_state[0], 0.0, TRIAL_AGAIN
     propose_trial(window)
     while verdict == TRIAL_AGAIN:
-        there = _evaluate_trial(step, window)
-        before, size = abs(step.objective_values[0]) + 2.0 * step.objective_values[2], step.objective_values[1]
-        now.objective_change, now.roundoff = (
-            there - step.objective_values[0],
-            TERM_ROUNDOFF * (before + np.sqrt(2.0 * before * size)),
-        )
+        there = evaluate_trial(step, window)
+        now.objective_change, now.roundoff = there - step.objective_values[0], bound_roundoff(step)
         verdict = assess_trial(window)
     if verdict == TRIAL_STALLED:
         return False
     step.objective_values[0] = there
-    _solve_rows(step.iteration_plan, window.trial_descent, len(window.direction), step.solution_rows)
+    solve_trial(step, window)
     accept_trial(window, step.solution_rows)
     return True
 
 
 @jit_inner
-def _evaluate_trial(step, window):
+def bound_roundoff(step):
+    """Return the bound on the rounding error of the objective [J]."""
+    before, size = abs(step.objective_values[0]) + 2.0 * step.objective_values[2], step.objective_values[1]
+    return TERM_ROUNDOFF * (before + np.sqrt(2.0 * before * size))
+
+
+@jit_inner
+def solve_trial(step, window):
+    """Write the plain correction at the trial point to the solution rows [m]."""
+    _solve_rows(step.iteration_plan, window.trial_descent, len(window.direction), step.solution_rows)
+
+
+@jit_inner
+def evaluate_trial(step, window):
+    """Write minus the gradient at the trial point [N], and return the objective there [J]."""
     return value_and_descent(
         step.spring_packets, step.objective_weights, window.trial_position, step.right_hand_side, window.trial_descent
     )
 
 
 @jit_inner
-def _residual(state):
+def compute_residual(state):
     """Return |c|_Q [J^(1/2)] over the unpinned vertices."""
     step, window = state
     for i in range(len(window.correction) // 4):
@@ -165,7 +175,7 @@ def _residual(state):
     )
 
 
-_iterate_loop = build_compiled_loop(_step_state, _residual)
+_iterate_loop = build_compiled_loop(step_state, compute_residual)
 
 
 @jit_kernel
@@ -182,33 +192,6 @@ def run_solve(step: AcceleratedStep, window: AccelerationWindow, limits, out):
         Number of iterations, last residual [J^(1/2)] and termination reason.
     """
     answer = _iterate_loop((step, window), limits)
-    read_positions(step.vertex_rows, window.position, out)
-    return answer
-
-
-@jit_inner
-def _objective_decrease(state):
-    return state[1].window_state[0].objective_decrease
-
-
-_iterate_rounds = build_compiled_rounds(_step_state, _residual, _objective_decrease)
-
-
-@jit_kernel
-def run_solve_rounds(step: AcceleratedStep, window: AccelerationWindow, rounds, limits, out):
-    """Run rounds of iterations (`springbench.solvers.kernels.descent_rounds`) and write the positions to `out`.
-
-    Args:
-        step: data of the system; its vectors and objective values are updated.
-        window: state of the solve, from `start_solve`; updated.
-        rounds: state of the rounds (1,) of type ROUND_STATE_DTYPE, updated.
-        limits: limits of the loop, in rounds.
-        out: positions (n, 3) [m].
-
-    Returns:
-        Number of rounds, last residual [J^(1/2)] and termination reason.
-    """
-    answer = _iterate_rounds((step, window), rounds, limits)
     read_positions(step.vertex_rows, window.position, out)
     return answer
 

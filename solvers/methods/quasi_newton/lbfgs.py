@@ -114,14 +114,20 @@ class Lbfgs(WindowedAcceleration):
         base = prepare_local_global(system, energies, lambda Q: (AggregatedSweeps(Q, self.jacobi_sweeps), words))
         return _PreparedLbfgsJacobi(base, metric, scheme, FixedObjective(system))
 
-    def prepare_without_barriers(self, system: System) -> PreparedAccelerated:
-        """Prepare the method with the factor of Q, without barrier energies.
+    def prepare_with_sweeps(self, system: System) -> PreparedAccelerated:
+        """Prepare the method with the factor of Q, without barrier energies, with rounds that alternate with sweeps.
 
         Raises:
             NotPositiveDefinite: if the system leaves some positions undetermined.
             Unsupported: if Q does not fit in memory.
         """
-        return prepare_without_barriers(system, self._acceleration_scheme, self.linear_solver, self.precision)
+        from springbench.solvers.methods.quasi_newton.lbfgs_with_sweeps import (
+            LbfgsSweepEngine,
+        )  # imported only for the hybrid
+
+        return prepare_without_barriers(
+            system, self._acceleration_scheme, self.linear_solver, self.precision, LbfgsSweepEngine
+        )
 
     @property
     def _acceleration_scheme(self) -> AccelerationScheme:

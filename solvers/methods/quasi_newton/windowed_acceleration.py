@@ -13,10 +13,9 @@ the solve terminates as "stalled" and its iterate stays unchanged.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from springbench.solvers.contact.half_space.vertex_contact import without_vertex_contact
 from springbench.solvers.iteration.idle_contact import skip_idle_contact
 from springbench.solvers.iteration.iterative_solver import IterativeSolver, compute_max_coordinate
@@ -78,7 +77,11 @@ def prepare_accelerated(
 
 
 def prepare_without_barriers(
-    system: System, scheme: AccelerationScheme, linear: LinearSolverName, precision: Precision
+    system: System,
+    scheme: AccelerationScheme,
+    linear: LinearSolverName,
+    precision: Precision,
+    engine_class: type[CompiledEngine] | None = None,
 ) -> PreparedAccelerated:
     """Prepare the method that ignores the system's barrier energies, as `prepare_accelerated` does.
 
@@ -87,6 +90,7 @@ def prepare_without_barriers(
         scheme: coefficients of the acceleration.
         linear: solver of Q x = b.
         precision: floating-point type of its stored entries.
+        engine_class: class of the engine of compiled energies, `CompiledEngine` if omitted.
 
     Raises:
         Unsupported: for energies that the method does not support.
@@ -105,7 +109,7 @@ def prepare_without_barriers(
         return PreparedAccelerated(
             base, _build_interpreted_engine(scheme, FixedObjective(system).ignore_barriers(), base)
         )
-    engine = CompiledEngine(scheme, found)
+    engine = (engine_class or CompiledEngine)(scheme, found)
     if without_vertex_contact(system) is system:
         return PreparedAccelerated(found.base, engine)
     objective = FixedObjective(system).ignore_barriers()
@@ -218,7 +222,6 @@ class CompiledEngine:
         self._solve_kernels = _SolveKernels(
             TypedKernel(accelerated_step.start_solve),
             TypedKernel(accelerated_step.run_solve),
-            TypedKernel(accelerated_step.run_solve_rounds),
             TypedKernel(step_setup.read_positions),
         )
 
@@ -260,10 +263,13 @@ class CompiledEngine:
         return self._init_state(problem, initial_guess, start)
 
     def _init_state(self, problem: StepProblem, guess: Positions, start: int) -> CompiledAccelerationState:
-        memory = self._free_states.pop() if self._free_states else self._allocate_state()
         return CompiledAccelerationState(
-            self._free_states, memory, self._solve_kernels, self._spring_form, problem, guess, start
+            self._free_states, self._take_memory(), self._solve_kernels, self._spring_form, problem, guess, start
         )
+
+    def _take_memory(self) -> _AccelerationMemory:
+        """Return the work arrays of a solve that has ended, or allocate them."""
+        return self._free_states.pop() if self._free_states else self._allocate_state()
 
 
 _AccelerationMemory = tuple[accelerated_step.AcceleratedStep, AccelerationWindow]
@@ -275,7 +281,6 @@ class _SolveKernels(NamedTuple):
 
     start_solve: TypedKernel
     run_solve: TypedKernel
-    run_solve_rounds: TypedKernel
     read_positions: TypedKernel
 
 
@@ -316,6 +321,7 @@ class CompiledAccelerationState(AcceleratedState):
             as_kernel_array, (problem.inertial_target, problem.external_force, problem.pin_targets, guess)
         )
         force = parts.compute_force(problem) if parts.form_builders else external
+        self._problem, self._step_arrays = problem, (target, force, pins)
         self.positions = np.empty(guess.shape)
         self.guess_residual, self.start_residual = solve_kernels.start_solve.call(
             step, window, target, force, pins, at, external, start, self.positions
@@ -329,15 +335,6 @@ class CompiledAccelerationState(AcceleratedState):
     def run_iterations(self, limits: LoopLimits) -> tuple[int, float, int]:
         """Run iterations within the limits; return count, residual and reason."""
         return self._solve_kernels.run_solve.call(*self._state, limits, self.positions)
-
-    def run_rounds(self, rounds: NDArray[Any], limits: LoopLimits) -> tuple[int, float, int]:
-        """Run rounds of iterations within the limits, compiled.
-
-        Args:
-            rounds: state of the rounds (1,), updated.
-            limits: limits, in rounds.
-        """
-        return self._solve_kernels.run_solve_rounds.call(*self._state, rounds, limits, self.positions)
 
     def step_state(self) -> bool:
         """Do one iteration; return False if round-off prevents any further change."""

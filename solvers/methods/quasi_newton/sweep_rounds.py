@@ -1,0 +1,141 @@
+"""Rounds of L-BFGS that alternate with sweeps of vertex block descent, without Python.
+
+    p <- S^5(L^10(p))     L an iteration of L-BFGS, S a sweep over all vertices
+
+This is a multiplicative composition of two nonlinear solvers (Brune, Knepley, Smith and Tu 2015, "Composing scalable
+nonlinear algebraic solvers"). L-BFGS, preconditioned by Q, reduces smooth errors in few iterations, but Q is much
+stiffer than the Hessian along springs that turn or are compressed. A sweep uses the Hessian of each vertex, which
+reduces such local errors, and smooth ones hardly.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from springbench.solvers.jit.kernel_compilation import jit_inner, jit_kernel
+from springbench.solvers.kernels.accelerated_descent import AccelerationWindow, accept_trial
+from springbench.solvers.kernels.descent_rounds import build_compiled_rounds
+from springbench.solvers.kernels.step_setup import VertexRows, read_positions
+from springbench.solvers.methods.quasi_newton.accelerated_step import (
+    AcceleratedStep,
+    bound_roundoff,
+    compute_residual,
+    evaluate_trial,
+    solve_trial,
+    step_state,
+)
+from springbench.solvers.methods.vertex_block.vbd import SweepMemory
+from springbench.solvers.methods.vertex_block.vbd_sweeps import ColourPackets, run_iterations, start_sweeps
+from springbench.solvers.simd.dot_products import ordered_dot
+
+ROUND_SWEEPS = 5
+"""Sweeps of a round."""
+
+
+class SweepStep(NamedTuple):
+    """The packets and rows of the sweeps of a system, with the data of a step and the arrays of a solve.
+
+    Attributes:
+        colour_packets: packets of the free vertices.
+        vertex_rows: rows of the vertices.
+        spectral_radius: spectral radius of Chebyshev's extrapolation.
+        sweep_memory: positions in rows of four [m], right-hand side by packets [N], and scratch.
+        inertial_target, force: inertial target [m] and external force [N], (n, 3).
+        pin_targets: targets of the pins (q, 3) [m].
+    """
+
+    colour_packets: ColourPackets
+    vertex_rows: VertexRows
+    spectral_radius: float
+    sweep_memory: SweepMemory
+    inertial_target: NDArray[np.float64]
+    force: NDArray[np.float64]
+    pin_targets: NDArray[np.float64]
+
+
+@jit_inner
+def _step_window(state):
+    step, window, sweeps, _ = state
+    sweeps.sweep_memory[2].omega[0] = -1.0
+    return step_state((step, window))
+
+
+@jit_inner
+def _window_residual(state):
+    step, window, _, _ = state
+    return compute_residual((step, window))
+
+
+@jit_inner
+def _window_decrease(state):
+    return state[1].window_state[0].objective_decrease
+
+
+@jit_inner
+def _sweep_vertices(state):
+    """Do a round of sweeps, unless it raises the objective or, within round-off, the residual.
+
+    The change is a pair of the history like that of an iteration. Sweeps that follow each other continue Chebyshev's
+    extrapolation, whose factor is negative before the first one.
+    """
+    step, window, sweeps, out = state
+    now, (rows, right, scratch) = window.window_state[0], sweeps.sweep_memory
+    if scratch.omega[0] < 0.0:
+        read_positions(step.vertex_rows, window.position, out)
+        start_sweeps(
+            sweeps.vertex_rows,
+            sweeps.inertial_target,
+            sweeps.force,
+            sweeps.pin_targets,
+            out,
+            right,
+            scratch,
+            rows,
+        )
+    run_iterations(sweeps.colour_packets, None, None, right, sweeps.spectral_radius, scratch, rows, ROUND_SWEEPS)
+    source, destination = sweeps.vertex_rows.row_of_vertex, step.vertex_rows.row_of_vertex
+    for v in range(len(source)):
+        for c in range(3):
+            window.trial_position[4 * destination[v] + c] = rows[4 * source[v] + c]
+    there = evaluate_trial(step, window)
+    change, roundoff = there - step.objective_values[0], bound_roundoff(step)
+    if change > roundoff:
+        scratch.omega[0] = -1.0
+        return
+    solve_trial(step, window)
+    if change >= -roundoff:
+        after = ordered_dot(window.trial_descent, step.solution_rows, len(window.direction))
+        if after >= now.correction_squarednorm:
+            scratch.omega[0] = -1.0
+            return
+        change = 0.0
+    now.objective_decrease -= change
+    step.objective_values[0] = there
+    accept_trial(window, step.solution_rows)
+
+
+_iterate_rounds = build_compiled_rounds(_step_window, _window_residual, _window_decrease, _sweep_vertices)
+
+
+@jit_kernel
+def run_sweep_rounds(
+    step: AcceleratedStep, window: AccelerationWindow, sweeps: SweepStep, rounds: Any, limits: Any, out: Any
+):
+    """Run rounds of iterations (`springbench.solvers.kernels.descent_rounds`) and write the positions to `out`.
+
+    Args:
+        step: data of the system; its vectors and objective values are updated.
+        window: state of the solve, from `accelerated_step.start_solve`; updated.
+        sweeps: data of the sweeps; its arrays of the solve are updated.
+        rounds: state of the rounds (1,) of type ROUND_STATE_DTYPE, updated.
+        limits: limits of the loop, in rounds.
+        out: positions (n, 3) [m].
+
+    Returns:
+        Number of rounds, last residual [J^(1/2)] and termination reason.
+    """
+    answer = _iterate_rounds((step, window, sweeps, out), rounds, limits)
+    read_positions(step.vertex_rows, window.position, out)
+    return answer
