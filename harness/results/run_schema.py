@@ -169,7 +169,7 @@ RUN_COLUMNS = (
         "methods that the solver switched between in the step, each with its iterations, its time and its share of the "
         "cost; the time is the processor time of the solving thread in the untimed pass, from the start of the method "
         "to that of the next one, checks included; the cost is counted in operations, and decides which method "
-        "continues; null for a solver of one method",
+        "continues; `lbfgs` includes the sweeps between its iterations; null for a solver of one method",
     ),
     ColumnSpec(
         "residual",

@@ -132,11 +132,13 @@ def build_rounds(
     Returns:
         A function (state, rounds, limits), `rounds` of `ROUND_STATE_DTYPE` (1,) and limits in rounds. It returns the
         number of rounds, the last residual and the termination reason. Without a limit of the residual, it is computed
-        only where a decision needs it, and may be nan.
+        only where a decision needs it, and by a call for no rounds; else it is nan.
     """
 
     def iterate(state: Any, rounds: Any, limits: Any) -> Any:
         now, count, found, ended = rounds[0], 0, np.nan, REASON_ITERATIONS
+        if limits.max_iterations == 0:
+            return 0, residual(state), REASON_ITERATIONS
         if now.initial_residual < 0.0:
             now.initial_residual = now.group_residual = now.segment_residual = residual(state)
         while ended == REASON_ITERATIONS and count < limits.max_iterations:

@@ -43,6 +43,10 @@ ONE_ITERATION = LoopLimits(1, 0.0, 0.0, RESIDUAL_NEVER)
 """One iteration without a residual."""
 
 
+NO_ITERATIONS = LoopLimits(0, 0.0, 0.0, RESIDUAL_LAST)
+"""No iteration, but the residual."""
+
+
 def iteration_limit(iterations: int) -> LoopLimits:
     """Return limits of n iterations with the last residual."""
     return LoopLimits(iterations, 0.0, 0.0, RESIDUAL_LAST)

@@ -69,6 +69,7 @@ from springbench.solvers.iteration.saddle_check import SaddleCheck
 from springbench.solvers.iteration.solver_info import Citation, SolverInfo
 from springbench.solvers.kernels.descent_rounds import GROUP_ITERATIONS, REASON_SWITCH, init_rounds
 from springbench.solvers.kernels.iteration_loop import (
+    NO_ITERATIONS,
     ONE_ITERATION,
     REASON_ITERATIONS,
     REASON_STALLED,
@@ -420,6 +421,12 @@ class LbfgsFirstState(HybridState):
         if ended in (REASON_STALLED, REASON_SWITCH) or residual <= self._floor:
             self._end_lbfgs_alone(run, residual, ended)
         return True
+
+    def residual(self) -> float:
+        """Return the residual [J^(1/2)] at the current positions."""
+        if self._run is not None and self._control.residual is None:
+            self._control.residual = self._run.run_rounds(self._rounds, NO_ITERATIONS)[1]
+        return super().residual()
 
     def _end_lbfgs_alone(self, run: CompiledAccelerationState, residual: float, ended: int) -> None:
         """End the phase of L-BFGS alone, and continue with the choice between the methods."""

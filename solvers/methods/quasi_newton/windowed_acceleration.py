@@ -23,7 +23,7 @@ from springbench.solvers.jit.typed_kernel import TypedKernel, as_kernel_array
 from springbench.solvers.kernels import step_setup
 from springbench.solvers.kernels.accelerated_descent import AccelerationWindow
 from springbench.solvers.kernels.acceleration_coefficients import require_history_size
-from springbench.solvers.kernels.iteration_loop import ONE_ITERATION, LoopLimits, iteration_limit
+from springbench.solvers.kernels.iteration_loop import NO_ITERATIONS, ONE_ITERATION, LoopLimits
 from springbench.solvers.kernels.padding_coordinate import PADDING_COORDINATE
 from springbench.solvers.kernels.spring_objective import ObjectiveWeights
 from springbench.solvers.linalg.memory import allocate_aligned
@@ -342,7 +342,7 @@ class CompiledAccelerationState(AcceleratedState):
 
     def residual(self) -> float:
         """Return the residual [J^(1/2)] at the iterate."""
-        return self.run_iterations(iteration_limit(0))[1]
+        return self.run_iterations(NO_ITERATIONS)[1]
 
     @property
     def objective_decrease(self) -> float:
