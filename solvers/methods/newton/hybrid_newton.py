@@ -18,7 +18,8 @@ would have no digit: the iterations are then limited by memory bandwidth, and di
 is the better of the initial guess and the inertial prediction. Near the minimum, where a round of L-BFGS decreases the
 objective by at most a hundredth of the decrease so far, groups of its iterations alternate with rounds of sweeps of
 vertex block descent (`springbench.solvers.methods.quasi_newton.sweep_rounds`), as long as each round of sweeps halves
-the residual or nearly so. If no diagonal entry of Q exceeds the inertia much, the sweeps come first.
+the residual or nearly so. If no diagonal entry of Q exceeds the inertia much, the sweeps come first; if one exceeds it
+by more than half of the digits, there are none.
 
 One rule decides which of the three methods continues: that with the largest decrease of the objective per cost in its
 last steps. A method that was not yet measured is credited with the decrease that L-BFGS leaves, extrapolated from its
@@ -132,6 +133,10 @@ _LBFGS_NANOSECONDS, _SWEEP_NANOSECONDS, _NEWTON_NANOSECONDS = (1e3, 17.0, 2.0), 
 """Costs of an L-BFGS iteration (constant, per spring, per entry of the factor), of a sweep (constant, per spring) and
 of a Newton step (constant, per flop, per entry), fitted to 16 scenes of 6 to 4096 vertices on one core with AVX-512;
 their ratio alone matters."""
+
+_MAX_SWEEP_RATIO = float(np.finfo(np.float64).eps) ** -0.5
+"""Largest ratio of the diagonal of Q to the inertia at which there are sweeps: beyond it the rounding of positions
+changes the elastic energy by more than the sweeps decrease the objective."""
 
 _SWEEP_FIRST_RATIO = 500.0
 """Largest ratio of the diagonal of Q to the inertia at which a solve starts with sweeps: Chebyshev's iteration then
@@ -577,7 +582,7 @@ class HybridIteration:
         self.newton_cost = newton_cost / (GROUP_ITERATIONS * lbfgs_cost)
         constant, per_spring = _SWEEP_NANOSECONDS
         sweep_cost = ROUND_SWEEPS * (constant + per_spring * springs)
-        has_sweeps = lbfgs.can_start_lower
+        has_sweeps = lbfgs.can_start_lower and bool((metric.free_diagonal <= _MAX_SWEEP_RATIO * inertia).all())
         self.sweep_cost = max(1, round(sweep_cost / lbfgs_cost)) if has_sweeps else 0
         self.starts_sweeping = has_sweeps and bool((metric.free_diagonal <= _SWEEP_FIRST_RATIO * inertia).all())
         self._check_cost = _COLLISION_CHECK_COST if objective.has_barriers else _RESIDUAL_COST
