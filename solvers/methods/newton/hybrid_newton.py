@@ -1,4 +1,4 @@
-"""Hybrid of L-BFGS and Newton's method with predicted tensions, which ends with Newton's method.
+"""Hybrid of L-BFGS, vertex sweeps and Newton's method with predicted tensions, which ends with Newton's method.
 
     H(t) = M/dt^2 + sum_e k nn' + t_e/l_e (I - nn'),   d = -H(t)^-1 grad g(p),   t_e <- k_e (l_e + n (A d)_e - r_e)
 
@@ -163,7 +163,7 @@ class HybridNewton:
         ),
         is_family_default=True,
         formula="L-BFGS and sweeps, then Newton with predicted tensions",
-        cost="1 L-BFGS iteration or 1 Newton step",
+        cost="1 round of L-BFGS or sweeps, or 1 Newton step",
     )
 
     def prepare(self, system: System) -> PreparedSolver:

@@ -121,12 +121,10 @@ class Lbfgs(WindowedAcceleration):
             NotPositiveDefinite: if the system leaves some positions undetermined.
             Unsupported: if Q does not fit in memory.
         """
-        from springbench.solvers.methods.quasi_newton.lbfgs_with_sweeps import (
-            LbfgsSweepEngine,
-        )  # imported only for the hybrid
+        from springbench.solvers.methods.quasi_newton import lbfgs_with_sweeps  # imported only for the hybrid
 
         return prepare_without_barriers(
-            system, self._acceleration_scheme, self.linear_solver, self.precision, LbfgsSweepEngine
+            system, self._acceleration_scheme, self.linear_solver, self.precision, lbfgs_with_sweeps.LbfgsSweepEngine
         )
 
     @property

@@ -58,7 +58,7 @@ class SweepStep(NamedTuple):
 @jit_inner
 def _step_window(state):
     step, window, sweeps, _ = state
-    sweeps.sweep_memory[2].omega[0] = -1.0
+    sweeps.sweep_memory.sweep_scratch.omega[0] = -1.0
     return step_state((step, window))
 
 
