@@ -1,4 +1,4 @@
-"""Hybrid of L-BFGS, vertex sweeps and Newton's method with predicted tensions, which ends with Newton's method.
+"""Hybrid of L-BFGS, vertex sweeps, Newton's method with predicted tensions and Newton's method.
 
     H(t) = M/dt^2 + sum_e k nn' + t_e/l_e (I - nn'),   d = -H(t)^-1 grad g(p),   t_e <- k_e (l_e + n (A d)_e - r_e)
 

@@ -115,7 +115,7 @@ def _start_window(step, window):
     """Start the window at the trial point and return the residual [J^(1/2)] there."""
     solve_trial(step, window)
     init_window(window, step.solution_rows)
-    return compute_residual((step, window))
+    return compute_window_residual((step, window))
 
 
 @jit_inner
@@ -145,20 +145,30 @@ def bound_roundoff(step):
 
 @jit_inner
 def solve_trial(step, window):
-    """Write the plain correction at the trial point to the solution rows [m]."""
+    """Write the plain correction at the trial point to the solution rows [m].
+
+    Args:
+        step: data of the system.
+        window: state of the solve, with the descent at its trial point.
+    """
     _solve_rows(step.iteration_plan, window.trial_descent, len(window.direction), step.solution_rows)
 
 
 @jit_inner
 def evaluate_trial(step, window):
-    """Write minus the gradient at the trial point [N], and return the objective there [J]."""
+    """Write minus the gradient at the trial point [N], and return the objective there [J].
+
+    Args:
+        step: data of the system.
+        window: state of the solve, with a trial point.
+    """
     return value_and_descent(
         step.spring_packets, step.objective_weights, window.trial_position, step.right_hand_side, window.trial_descent
     )
 
 
 @jit_inner
-def compute_residual(state):
+def compute_window_residual(state):
     """Return |c|_Q [J^(1/2)] over the unpinned vertices."""
     step, window = state
     for i in range(len(window.correction) // 4):
@@ -175,7 +185,7 @@ def compute_residual(state):
     )
 
 
-_iterate_loop = build_compiled_loop(step_state, compute_residual)
+_iterate_loop = build_compiled_loop(step_state, compute_window_residual)
 
 
 @jit_kernel

@@ -115,7 +115,7 @@ class Lbfgs(WindowedAcceleration):
         return _PreparedLbfgsJacobi(base, metric, scheme, FixedObjective(system))
 
     def prepare_with_sweeps(self, system: System) -> PreparedAccelerated:
-        """Prepare the method with the factor of Q, without barrier energies, with rounds that alternate with sweeps.
+        """Prepare rounds that alternate with sweeps, with the factor of Q and without barrier energies.
 
         Raises:
             NotPositiveDefinite: if the system leaves some positions undetermined.

@@ -21,7 +21,7 @@ from springbench.solvers.kernels.step_setup import VertexRows, read_positions
 from springbench.solvers.methods.quasi_newton.accelerated_step import (
     AcceleratedStep,
     bound_roundoff,
-    compute_residual,
+    compute_window_residual,
     evaluate_trial,
     solve_trial,
     step_state,
@@ -35,7 +35,7 @@ ROUND_SWEEPS = 5
 
 
 class SweepStep(NamedTuple):
-    """The packets and rows of the sweeps of a system, with the data of a step and the arrays of a solve.
+    """The data of sweeps in a step, and the arrays of a solve.
 
     Attributes:
         colour_packets: packets of the free vertices.
@@ -65,7 +65,7 @@ def _step_window(state):
 @jit_inner
 def _window_residual(state):
     step, window, _, _ = state
-    return compute_residual((step, window))
+    return compute_window_residual((step, window))
 
 
 @jit_inner
