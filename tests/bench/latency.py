@@ -458,7 +458,12 @@ def publish_measurements(measurements: Sequence[Mapping[str, Any]], folder: Path
     rows = sorted(stated, key=lambda one: (list(LATENCY_ROWS).index(one["row"]), one["repeat"]))
     table = pa.Table.from_pylist([dict(one) for one in rows], MEASUREMENT_SCHEMA)
     publish_tables(
-        folder, QUICKSTART, "python -m tests.bench.latency", {"measurements": table}, [begin, describe_provenance()]
+        folder,
+        QUICKSTART,
+        "python -m tests.bench.latency",
+        {"measurements": table},
+        [begin, describe_provenance()],
+        has_earlier_rows=bool(earlier),
     )
 
 

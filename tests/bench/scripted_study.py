@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shlex
 import sys
@@ -17,7 +18,7 @@ from springbench.harness.experiments.archive.study_publication import (
     write_study_file,
 )
 from springbench.harness.experiments.provenance import build_provenance_columns
-from springbench.harness.results.published_set import TABLE_FILES, compute_file_digest
+from springbench.harness.results.published_set import STUDY_FILE, TABLE_FILES, compute_file_digest
 
 
 def describe_provenance() -> dict[str, Any]:
@@ -43,6 +44,7 @@ def publish_tables(
     moments: Sequence[Mapping[str, Any]],
     *,
     is_timed: bool = True,
+    has_earlier_rows: bool = False,
 ) -> None:
     """Write tables and what made them as a published study.
 
@@ -53,6 +55,7 @@ def publish_tables(
         tables: tables by their names in TABLE_FILES.
         moments: values of `describe_provenance`, of which the first and the last give dates and load.
         is_timed: whether times are among the results.
+        has_earlier_rows: whether the tables include rows that were published before, by other code or machines.
     """
     folder.mkdir(parents=True, exist_ok=True)
     for name, table in tables.items():
@@ -65,8 +68,24 @@ def publish_tables(
         **summarise_provenance(moments),
         "runs": max(map(len, tables.values())),
     }
+    if has_earlier_rows:
+        metadata = add_provenance(json.loads((folder / STUDY_FILE).read_text()), metadata)
     write_study_file(folder, metadata)
     print_message(f"published in {folder}")
+
+
+def add_provenance(earlier: Mapping[str, Any], new: Mapping[str, Any]) -> dict[str, Any]:
+    """Return new metadata of a study with the machines, commits, dates and loads of earlier ones added."""
+    united = {
+        name: [*earlier[name], *(one for one in new[name] if one not in earlier[name])]
+        for name in ("commits", "machines")
+    }
+    extremes = {
+        name: [min(values), max(values)]
+        for name in ("started", "load_average")
+        if (values := [*earlier[name], *new[name]])
+    }
+    return {**new, **united, **extremes}
 
 
 def publish_rows(

@@ -32,7 +32,7 @@ from springbench.harness.report.plot_style import SeriesStyle
 from springbench.harness.results.published_set import read_study
 from typer.testing import CliRunner
 
-from tests.bench.scripted_study import describe_provenance, publish_rows
+from tests.bench.scripted_study import add_provenance, describe_provenance, publish_rows
 from tests.contracts.hostile import scene
 from tests.synthetic_accuracy_rows import build_work_rows, write_accuracy_rows
 from tests.synthetic_run_rows import write_dummy_runs
@@ -280,3 +280,15 @@ def test_a_heat_map_states_shares_in_percent() -> None:
     panel = build_page_panel("shares", "heatmap", points, PageChartOptions())
     assert isinstance(panel, CellMap)
     assert [(cell.value_text, cell.outcome) for cell in panel.cells] == [("83", "80 % and more"), ("", "none")]
+
+
+def test_a_study_with_earlier_rows_states_the_machines_and_commits_of_all():
+    earlier = {"commits": ["a"], "machines": [{"cpu": "x"}], "started": ["1", "3"], "load_average": [1.0], "runs": 4}
+    new = {"commits": ["b", "a"], "machines": [{"cpu": "y"}], "started": ["2", "5"], "load_average": [], "runs": 6}
+    assert add_provenance(earlier, new) == {
+        "commits": ["a", "b"],
+        "machines": [{"cpu": "x"}, {"cpu": "y"}],
+        "started": ["1", "5"],
+        "load_average": [1.0, 1.0],
+        "runs": 6,
+    }

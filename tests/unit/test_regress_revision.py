@@ -99,6 +99,21 @@ def test_solutions_that_differ_fail_before_anything_is_timed(repository: Path):
     assert "the answers differ by 5.0e-01 of their size, at most 1e-09 is allowed; nothing was timed" in said
 
 
+def test_a_gate_that_lacks_its_input_is_skipped_with_its_reason(repository: Path):
+    gates = repository / "tests" / "bench" / "test_gates.py"
+    skip = 'candidate=lambda: pytest.skip("there is no folder shared")'
+    missing = f'    SimpleNamespace(name="absent", clock="cpu", {skip}),\n)'
+    gates.write_text("import pytest\n" + gates.read_text().rstrip().removesuffix(")") + missing)
+    commit(repository)
+    code, said = regress("--baseline", "HEAD", "--budget", "0.001")
+    assert code == 3, said
+    assert "absent: skipped: there is no folder shared" in said
+    assert "adding: inconclusive" in said
+    code, said = regress("--baseline", "HEAD", "-k", "absent")
+    assert code == 2, said
+    assert "no work can be compared" in said
+
+
 def test_a_revision_that_cannot_be_run_gives_its_own_reason(repository: Path):
     (repository / "tests" / "bench" / "test_gates.py").write_text("ALL = (\n")
     commit(repository)

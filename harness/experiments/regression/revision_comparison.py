@@ -30,6 +30,7 @@ from springbench.harness.experiments.regression.revision_process import (
     GitRevision,
     PreparedWork,
     RevisionProcess,
+    WorkSkipped,
     describe_changes,
     start_workers,
 )
@@ -147,10 +148,10 @@ def compare_revisions(
         print_message: receives one line per result, and estimates of the remaining time.
 
     Returns:
-        The requests in their order, with their results.
+        The requests in their order, with their results, without those that lack an input.
 
     Raises:
-        InputError: if the work fails, or if the answers differ.
+        InputError: if the work fails, if the answers differ, or if no work can be compared.
     """
     budgets = [options.budget] if len(requests) == 1 else [FIRST_PASS_SHARE * options.budget, options.budget]
     rule = SequentialTest(options.max_ratio, options.alpha / (len(requests) * len(budgets)))
@@ -163,19 +164,24 @@ def compare_revisions(
         began = monotonic()
         for done, index in enumerate(todo, start=1):
             request = requests[index]
-            result = run_confirmed_benchmark(
-                partial(start_revisions, revisions, request, options, print_once), rule, time_budget=budget
-            )
-            found[index] = result
+            try:
+                found[index] = result = run_confirmed_benchmark(
+                    partial(start_revisions, revisions, request, options, print_once), rule, time_budget=budget
+                )
+            except WorkSkipped as reason:
+                print_message(f"{request.title}: skipped: {reason}")
+                continue
             is_final = budget == budgets[-1] or result.verdict is not RegressionVerdict.INCONCLUSIVE
             print_message(f"{request.title}: {result if is_final else 'undecided so far'}")
             if done < len(todo):
                 left = _format_minutes((monotonic() - began) / done * (len(todo) - done))
                 print_message(f"{done} of {len(todo)}, about {left} left in this pass")
-        todo = [index for index in todo if found[index].verdict is RegressionVerdict.INCONCLUSIVE]
+        todo = [k for k in todo if k in found and found[k].verdict is RegressionVerdict.INCONCLUSIVE]
         if not todo:
             break
-    return [(request, found[index]) for index, request in enumerate(requests)]
+    if not found:
+        raise InputError("no work can be compared: each of the comparisons lacks an input, as their lines say")
+    return [(request, found[index]) for index, request in enumerate(requests) if index in found]
 
 
 def _format_minutes(seconds: float) -> str:

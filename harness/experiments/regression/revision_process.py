@@ -71,6 +71,10 @@ class PreparedWork:
     num_frames: int
 
 
+class WorkSkipped(Exception):
+    """The work lacks an input outside the checkout."""
+
+
 class RevisionProcess:
     """A process that runs one revision's work; errors become InputErrors with the revision's own message."""
 
@@ -96,6 +100,7 @@ class RevisionProcess:
 
         Raises:
             InputError: with the worker's message, or if its process has ended.
+            WorkSkipped: if the work lacks an input.
         """
         process = self._process
         assert process.stdin is not None
@@ -112,6 +117,8 @@ class RevisionProcess:
         answer = json.loads(line)
         if "error" in answer:
             raise InputError(f"{self.revision.name}: cannot be run: {answer['error']}")
+        if "skipped" in answer:
+            raise WorkSkipped(answer["skipped"])
         return answer
 
     def prepare_work(self, command: str, **arguments: Any) -> PreparedWork:
@@ -123,6 +130,7 @@ class RevisionProcess:
 
         Raises:
             InputError: with the worker's message, or if its process has ended.
+            WorkSkipped: if the work lacks an input.
         """
         reply = self.send_request(command, positions=str(self._answer_path), **arguments)
         return PreparedWork(np.load(self._answer_path), reply["stats"], reply["clock"], reply.get("num_frames", 0))
