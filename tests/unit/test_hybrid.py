@@ -172,7 +172,7 @@ def test_more_sweeps_follow_if_two_rounds_reduce_the_objective_to_a_tenth(residu
     assert rounds.segment_end == rounds.num_iterations + descent_rounds.GROUP_ITERATIONS
 
 
-def test_sweeps_help_lbfgs_where_springs_are_compressed(monkeypatch):
+def test_sweeps_help_lbfgs_where_springs_are_compressed():
     """A cloth whose edges are moved together by a tenth: a gap of 1e-6 takes fewer iterations and sweeps."""
     given = stiff(1e3)
     squeezed = given.current_positions * [0.9, 1.0, 1.0]
@@ -188,7 +188,6 @@ def test_sweeps_help_lbfgs_where_springs_are_compressed(monkeypatch):
         while given.value(run.positions) - given.value(lowest) > 1e-6 * (start - given.value(lowest)):
             run.step_state()
         counts.append(int(run._rounds["num_iterations"][0]))
-    print(counts)
     assert counts[0] < counts[1]
 
 

@@ -12,7 +12,7 @@ from springbench.solvers.jit.typed_kernel import TypedKernel
 from springbench.solvers.kernels.iteration_loop import LoopLimits
 from springbench.solvers.methods.local_global.accelerated_local_global import AccelerationScheme
 from springbench.solvers.methods.local_global.fused_local_global import PreparedCompiledLocalGlobal
-from springbench.solvers.methods.quasi_newton.sweep_rounds import SweepStep, run_sweep_rounds
+from springbench.solvers.methods.quasi_newton.sweep_rounds import NOT_STARTED, SweepStep, run_sweep_rounds
 from springbench.solvers.methods.quasi_newton.windowed_acceleration import CompiledAccelerationState, CompiledEngine
 from springbench.solvers.methods.vertex_block import vbd
 from springbench.solvers.model.step_problem import Positions, StepProblem
@@ -68,11 +68,9 @@ class LbfgsSweepState(CompiledAccelerationState):
     def _start_sweeps(self) -> SweepStep:
         """Return the data of the sweeps in this solve."""
         made = self._engine.sweeps
-        memory = made.free_memory.pop() if made.free_memory else made.allocate_memory()
-        memory.sweep_scratch.omega[0] = -1.0
-        blocks = made.colour_packets
-        if made.spring_form.has_edges:
-            blocks = blocks._replace(spring_packets=made.spring_form.update_edges(blocks.spring_packets, self._problem))
+        memory = made.take_memory()
+        memory.sweep_scratch.omega[0] = NOT_STARTED
+        blocks = made.update_packets(self._problem)
         return SweepStep(blocks, made.vertex_rows, made.spectral_radius, memory, *self._step_arrays)
 
     def __del__(self) -> None:

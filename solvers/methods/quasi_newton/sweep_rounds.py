@@ -33,6 +33,9 @@ from springbench.solvers.simd.dot_products import ordered_dot
 ROUND_SWEEPS = 5
 """Sweeps of a round."""
 
+NOT_STARTED = -1.0
+"""Chebyshev factor before the first round of sweeps after an iteration of L-BFGS."""
+
 
 class SweepStep(NamedTuple):
     """The data of sweeps in a step, and the arrays of a solve.
@@ -58,7 +61,7 @@ class SweepStep(NamedTuple):
 @jit_inner
 def _step_window(state):
     step, window, sweeps, _ = state
-    sweeps.sweep_memory.sweep_scratch.omega[0] = -1.0
+    sweeps.sweep_memory.sweep_scratch.omega[0] = NOT_STARTED
     return step_state((step, window))
 
 
@@ -77,12 +80,11 @@ def _window_decrease(state):
 def _sweep_vertices(state):
     """Do a round of sweeps, unless it raises the objective or, within round-off, the residual.
 
-    The change is a pair of the history like that of an iteration. Sweeps that follow each other continue Chebyshev's
-    extrapolation, whose factor is negative before the first one.
+    Sweeps that follow each other continue Chebyshev's extrapolation.
     """
     step, window, sweeps, out = state
-    now, (rows, right, scratch) = window.window_state[0], sweeps.sweep_memory
-    if scratch.omega[0] < 0.0:
+    rows, right, scratch = sweeps.sweep_memory
+    if scratch.omega[0] == NOT_STARTED:
         read_positions(step.vertex_rows, window.position, out)
         start_sweeps(
             sweeps.vertex_rows,
@@ -99,21 +101,31 @@ def _sweep_vertices(state):
     for v in range(len(source)):
         for c in range(3):
             window.trial_position[4 * destination[v] + c] = rows[4 * source[v] + c]
-    there = evaluate_trial(step, window)
+    if not _accept_lower_trial(step, window):
+        scratch.omega[0] = NOT_STARTED
+
+
+@jit_inner
+def _accept_lower_trial(step, window):
+    """Accept a lower trial point, and return whether it was accepted.
+
+    The objective is lower there or, within round-off, the residual. The change is a pair of the history like that of an
+    iteration.
+    """
+    now, there = window.window_state[0], evaluate_trial(step, window)
     change, roundoff = there - step.objective_values[0], bound_roundoff(step)
     if change > roundoff:
-        scratch.omega[0] = -1.0
-        return
+        return False
     solve_trial(step, window)
     if change >= -roundoff:
         after = ordered_dot(window.trial_descent, step.solution_rows, len(window.direction))
         if after >= now.correction_squarednorm:
-            scratch.omega[0] = -1.0
-            return
+            return False
         change = 0.0
     now.objective_decrease -= change
     step.objective_values[0] = there
     accept_trial(window, step.solution_rows)
+    return True
 
 
 _iterate_rounds = build_compiled_rounds(_step_window, _window_residual, _window_decrease, _sweep_vertices)

@@ -244,8 +244,18 @@ class PreparedVertexBlockDescent(IterativeSolver):
         """Work arrays of solves that have ended."""
         return []
 
-    def allocate_memory(self) -> SweepMemory:
-        """Allocate the work arrays of a solve."""
+    def take_memory(self) -> SweepMemory:
+        """Return the work arrays of a solve that has ended, or allocate them."""
+        return self.free_memory.pop() if self.free_memory else self._allocate_memory()
+
+    def update_packets(self, problem: StepProblem) -> kernels.ColourPackets:
+        """Return the packets of the vertices, with the edges of a step."""
+        form, blocks = self.spring_form, self.colour_packets
+        if not form.has_edges:
+            return blocks
+        return blocks._replace(spring_packets=form.update_edges(blocks.spring_packets, problem))
+
+    def _allocate_memory(self) -> SweepMemory:
         packets, size = self.colour_packets.spring_packets, len(self.anchor_stiffness)
         entries = int(np.diff(packets.packet_start).max(initial=0))
         p, previous, older, descent = (allocate_aligned(4 * size) for _ in range(4))
@@ -325,17 +335,14 @@ class SweepState(SolverState):
 
     def __init__(self, prepared: PreparedVertexBlockDescent, problem: StepProblem, guess: Positions) -> None:
         self._prepared = prepared
-        self._memory = memory = prepared.free_memory.pop() if prepared.free_memory else prepared.allocate_memory()
-        form, blocks = prepared.spring_form, prepared.colour_packets
-        if form.has_edges:
-            blocks = blocks._replace(spring_packets=form.update_edges(blocks.spring_packets, problem))
+        self._memory = memory = prepared.take_memory()
         contacts = begin_active_contacts(problem)
         self._element_data = prepared.vertex_elements.update_elements(problem)
-        self._colour_packets, self._problem = blocks, problem
+        self._colour_packets, self._problem = prepared.update_packets(problem), problem
         self._compute_residual: Callable[[Positions], float] | None = None
         self._half_spaces = prepared.build_half_spaces(contacts) if contacts else None
         self._rows, self._right_hand_side, self._sweep_scratch = memory
-        given = problem.inertial_target, form.compute_force(problem), problem.pin_targets, guess
+        given = problem.inertial_target, prepared.spring_form.compute_force(problem), problem.pin_targets, guess
         prepared.sweep_kernels.start_sweeps.call(
             prepared.vertex_rows, *map(as_kernel_array, given), self._right_hand_side, self._sweep_scratch, self._rows
         )
