@@ -1,8 +1,9 @@
 """Compile the kernels of runs on all cores, before the first run starts.
 
 A run compiles each kernel at its first call, one after the other on one core. kernel_signatures.json states which
-kernels each solver calls, so that several processes can compile them, and end before anything is timed. Kernels that
-are not in the file are compiled when they are called. `python -m tests.record_kernels` writes the file.
+kernels each solver calls, and which the search of `run --error`, so that several processes can compile them, and end
+before anything is timed. Kernels that are not in the file are compiled when they are called.
+`python -m tests.record_kernels` writes the file.
 """
 
 from __future__ import annotations
@@ -26,13 +27,16 @@ if TYPE_CHECKING:
 
 SIGNATURES_PATH = Path(__file__).with_name("kernel_signatures.json")
 
+ERROR_CONTROL = "--error"
+"""Name in the file of what `run --error` calls."""
+
 _MAX_PROCESSES = 4
 
 
 class _SignatureTable(NamedTuple):
-    """Content of SIGNATURES_PATH: all kernels, and the numbers of those that each solver calls.
+    """Content of SIGNATURES_PATH: all kernels, and the numbers of those that each caller calls.
 
-    Kernels with the most machine code are first.
+    Callers are solvers and ERROR_CONTROL. Kernels with the most machine code are first.
     """
 
     kernels: list[KernelSignature]
@@ -45,26 +49,26 @@ class _SignatureTable(NamedTuple):
 
         stored = json.loads(SIGNATURES_PATH.read_text(encoding="utf-8"))
         kernels = [KernelSignature(name, tuple(arguments)) for name, arguments in stored["kernels"]]
-        return cls(kernels, stored["solvers"])
+        return cls(kernels, stored["callers"])
 
-    def select_kernels(self, solvers: Iterable[str]) -> list[KernelSignature]:
-        """Return the kernels that some of these solvers call."""
-        return [self.kernels[k] for k in sorted({k for solver in solvers for k in self.numbers.get(solver, ())})]
+    def select_kernels(self, callers: Iterable[str]) -> list[KernelSignature]:
+        """Return the kernels that some of these callers call."""
+        return [self.kernels[k] for k in sorted({k for caller in callers for k in self.numbers.get(caller, ())})]
 
-    def find_marker(self, solver: str) -> KernelSignature:
-        """Return the last of the kernels of a solver that the fewest other solvers call."""
+    def find_marker(self, caller: str) -> KernelSignature:
+        """Return the last of the kernels of a caller that the fewest others call."""
         num_callers = Counter(k for numbers in self.numbers.values() for k in numbers)
-        return self.kernels[min(self.numbers[solver], key=lambda k: (num_callers[k], -k))]
+        return self.kernels[min(self.numbers[caller], key=lambda k: (num_callers[k], -k))]
 
 
-def compile_missing_kernels(solvers: Iterable[str], print_message: Callable[[str], None]) -> None:
-    """Compile the kernels of solvers that the cache lacks, and wait for it.
+def compile_missing_kernels(callers: Iterable[str], print_message: Callable[[str], None]) -> None:
+    """Compile the kernels that the cache lacks, and wait for it.
 
-    Nothing is done if the cache contains the marker kernel of each solver. A kernel that cannot be compiled raises its
+    Nothing is done if the cache contains the marker kernel of each caller. A kernel that cannot be compiled raises its
     error when it is called.
 
     Args:
-        solvers: names of solvers.
+        callers: names of solvers, or ERROR_CONTROL.
         print_message: prints a remark.
     """
     num_processes = min(len(list_usable_cores()), _MAX_PROCESSES)
@@ -73,8 +77,8 @@ def compile_missing_kernels(solvers: Iterable[str], print_message: Callable[[str
     from springbench.solvers.jit.kernel_signatures import is_missing
 
     table = _SignatureTable.from_file()
-    known = [solver for solver in solvers if solver in table.numbers]
-    if not any(is_missing(table.find_marker(solver)) for solver in known):
+    known = [caller for caller in callers if caller in table.numbers]
+    if not any(is_missing(table.find_marker(caller)) for caller in known):
         return
     missing = [signature for signature in table.select_kernels(known) if is_missing(signature)]
 
@@ -87,9 +91,9 @@ def compile_missing_kernels(solvers: Iterable[str], print_message: Callable[[str
         report(f"compiling kernels (once): {count} of {len(missing)}")
 
 
-def list_kernels(solver: str) -> list[KernelSignature]:
-    """Return the kernels that a solver calls."""
-    return _SignatureTable.from_file().select_kernels([solver])
+def list_kernels(caller: str) -> list[KernelSignature]:
+    """Return the kernels that a solver, or ERROR_CONTROL, calls."""
+    return _SignatureTable.from_file().select_kernels([caller])
 
 
 def _ignore_progress(event: object) -> None:

@@ -17,7 +17,7 @@ import pytest
 from numba import typeof
 from springbench.harness.execution import interrupts
 from springbench.harness.experiments import kernel_precompilation
-from springbench.harness.experiments.kernel_precompilation import compile_missing_kernels, list_kernels
+from springbench.harness.experiments.kernel_precompilation import ERROR_CONTROL, compile_missing_kernels, list_kernels
 from springbench.solvers.jit.kernel_signatures import build_type, describe_type
 from springbench.solvers.kernels.iteration_loop import LoopLimits
 
@@ -58,7 +58,7 @@ def run_code(tmp_path: Path) -> Callable[..., str]:
 
     def run(code: str, *signatures: Any) -> str:
         path = tmp_path / "signatures.json"
-        path.write_text(json.dumps({"solvers": {"numba": [*range(len(signatures))]}, "kernels": signatures}))
+        path.write_text(json.dumps({"callers": {"numba": [*range(len(signatures))]}, "kernels": signatures}))
         variables = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache")}
         command = [sys.executable, "-c", code, str(path)]
         return subprocess.run(command, env=variables, check=True, capture_output=True, text=True).stdout
@@ -158,9 +158,9 @@ def test_one_core_compiles_nothing_ahead(monkeypatch: pytest.MonkeyPatch):
     compile_missing_kernels(["numba"], refuse)
 
 
-@pytest.mark.parametrize("solver", SOLVERS)
-def test_the_kernels_that_are_stated_are_those_that_a_run_calls(solver: str):
-    assert set(record_kernels(solver)) == {json.dumps(signature) for signature in list_kernels(solver)}
+@pytest.mark.parametrize("caller", [*SOLVERS, ERROR_CONTROL])
+def test_the_kernels_that_are_stated_are_those_that_a_run_calls(caller: str):
+    assert set(record_kernels(caller)) == {json.dumps(signature) for signature in list_kernels(caller)}
 
 
 def test_ctrl_c_ends_the_processes_that_compile(tmp_path: Path):

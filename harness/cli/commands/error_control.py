@@ -31,6 +31,7 @@ from springbench.harness.experiments.error_control.method_search import (
     search_cheapest_method,
 )
 from springbench.harness.experiments.error_control.method_trials import SearchResult, Trial
+from springbench.harness.experiments.error_control.motion_recording import MotionRecorder
 from springbench.harness.experiments.error_control.stored_trials import (
     ResultRow,
     build_trial_rows,
@@ -38,8 +39,9 @@ from springbench.harness.experiments.error_control.stored_trials import (
     read_stored_trials,
     select_best_predicted,
 )
+from springbench.harness.experiments.kernel_precompilation import ERROR_CONTROL, compile_missing_kernels
 from springbench.harness.experiments.provenance import build_provenance_columns
-from springbench.harness.recording.recorder_interface import RecordedFrame, RecordingInfo
+from springbench.harness.recording.recorder_interface import RecordingInfo
 from springbench.harness.recording.strain_shading import compute_strain_range
 from springbench.harness.reference.perturbation_growth import PerturbationGrowth
 from springbench.harness.reference.self_converged_trajectory import describe_self_convergence
@@ -89,6 +91,7 @@ def run_error_control(
     results: Path,
     print_message: PrintMessage,
     rejected_options: Mapping[str, Any],
+    recorder: MotionRecorder,
 ) -> bool:
     """Simulate the scene in a file to a relative error, and print the cost.
 
@@ -98,6 +101,7 @@ def run_error_control(
         results: folder of results.
         print_message: prints a message.
         rejected_options: other options on the command line, which are not supported here.
+        recorder: records the motion; for a scene with user code another one does.
 
     Returns:
         Whether energy has grown only by its sources and, if it is verified, the measured error is at most the requested
@@ -109,9 +113,13 @@ def run_error_control(
     """
     _check_options(request.error, request.t_end, rejected_options)
     scene = load_scene(config)
+    plugins = scene.find_plugins()
+    if plugins:
+        recorder = MotionRecorder(has_process=False)
+    recorder.wait_for_import()
     return run_isolated(
-        partial(_execute_error_control, config, scene, request, results),
-        scene.find_plugins(),
+        partial(_execute_error_control, config, scene, request, results, recorder),
+        plugins,
         TaskLimits(FixedOptions().time_limit),
         print_message,
     )
@@ -122,6 +130,7 @@ def _execute_error_control(
     scene: SceneSpec,
     request: ErrorRequest,
     results: Path,
+    recorder: MotionRecorder,
     print_message: PrintMessage,
 ) -> bool:
     error = request.error
@@ -136,6 +145,8 @@ def _execute_error_control(
                 error_target, error, results, print_message, print_message, list_contact_methods()
             )
         else:
+            if not scene.find_plugins():  # whose process starts no others
+                compile_missing_kernels([ERROR_CONTROL], print_message)
             seen = compute_predictability_horizon(error_target, error, print_message)
             answer = _search_method(error_target, error, seen, [] if request.rerun else before, print_message)
     path, best = answer.best_trial.trajectory, answer.best_trial
@@ -167,7 +178,7 @@ def _execute_error_control(
     row |= {name: value for name, value in energies.columns.items() if name in _ENERGY_COLUMNS}
     if RECORDINGS.is_installed():
         recording = _record_motion(
-            folder / "recordings" / f"{label}.rrd", config.stem, error_target, motion_scene, answer, status
+            recorder, folder / "recordings" / f"{label}.rrd", config.stem, error_target, motion_scene, answer, status
         )
         row["recording_path"] = f"recordings/{recording.name}"
         print_message(f"the recording is {recording}")
@@ -338,6 +349,7 @@ def _build_third_party_rows(
 
 
 def _record_motion(
+    recorder: MotionRecorder,
     path: Path,
     name: str,
     error_target: ErrorTarget,
@@ -377,13 +389,4 @@ def _record_motion(
             "commit": machine_info.read_commit(),
         },
     )
-    path.parent.mkdir(parents=True, exist_ok=True)
-    from springbench.harness.recording.rerun_recorder import RerunRecorder
-
-    recorder = RerunRecorder(path, info)
-    try:
-        for k, p in enumerate(best.trajectory.positions):
-            recorder.record_frame(RecordedFrame(k, k * error_target.frame_seconds, p, {}, float("nan"), 0))
-        return recorder.finish_recording({})
-    finally:
-        recorder.abandon_recording()
+    return recorder.write_recording(path, info, best.trajectory.positions)
