@@ -15,8 +15,8 @@ from llvmlite import binding
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler, CompileResult, compile_result
 
-LINKED_KIND = "linked"
-"""Mark that distinguishes the reduced form of `LinkedLibrary` from that of Numba's libraries."""
+LINKED_KIND, KERNEL_KIND = "linked", "kernel"
+"""Marks that distinguish the reduced forms of `LinkedLibrary` and `KernelLibrary` from that of Numba's libraries."""
 
 _C_WRAPPER_NAME = "cfunc_wrapper"
 """Name of the module in which Numba wraps a function for calls from C."""
@@ -59,6 +59,27 @@ class LinkedLibrary(_LIBRARY_CLASS):
         return _NullCodegen()
 
 
+class KernelLibrary(_LIBRARY_CLASS):
+    """Code that only Python calls: stored as machine code, without the bitcode for linking it into other code."""
+
+    def serialize_using_object_code(self) -> tuple[str, str, tuple[bytes, list[str]]]:
+        """Return the machine code, and the names that it defines."""
+        parts = (*self._final_module.functions, *self._final_module.global_variables)
+        names = [part.name for part in parts if not part.is_declaration]
+        return self.name, KERNEL_KIND, (self._get_compiled_object(), names)
+
+    @classmethod
+    def _unserialize(cls, codegen: Any, state: tuple[str, str, tuple[bytes, list[str]]]) -> KernelLibrary:
+        """Return the library of stored machine code."""
+        name, _, (object_code, names) = state
+        library = cls(codegen, name)
+        library.enable_object_caching()
+        library._set_compiled_object(object_code)
+        library._finalize_final_module()
+        codegen._engine._defined_symbols |= {*names}
+        return library
+
+
 class _NullCodegen:
     def set_env(self, name: str, env: Any) -> None:
         """Do nothing."""
@@ -84,7 +105,7 @@ class KernelCompiler(_COMPILER_CLASS):
     def compile_extra(self, function: Any) -> Any:
         """Compile a function, and all that it calls into `LinkedLibrary`."""
         codegen = self.state.targetctx.codegen()
-        self.state.library = _LIBRARY_CLASS(codegen, function.__qualname__)
+        self.state.library = KernelLibrary(codegen, function.__qualname__)
         self.state.library.enable_object_caching()
         with _use_library_class(codegen, LinkedLibrary):
             return super().compile_extra(function)
@@ -113,11 +134,12 @@ def rebuild_result(context: Any, reduced: Any) -> CompileResult:
 
     Args:
         context: target context of the process that loads the code.
-        reduced: output of the result's `_reduce`, of a `LinkedLibrary` or of Numba's.
+        reduced: output of the result's `_reduce`, of one of the libraries above or of Numba's.
     """
     (name, kind, content), fndesc, env, signature, objectmode, lifted, annotation, reload_init, envs = reduced
     if kind != LINKED_KIND:
-        with _use_library_class(context.codegen(), _LIBRARY_CLASS):
+        library_class = KernelLibrary if kind == KERNEL_KIND else _LIBRARY_CLASS
+        with _use_library_class(context.codegen(), library_class):
             return CompileResult._rebuild(context, *reduced)
     for function in reload_init:
         function()
