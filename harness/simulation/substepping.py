@@ -14,6 +14,7 @@ from time import perf_counter, thread_time
 from typing import ClassVar, Protocol, runtime_checkable
 
 import numpy as np
+from numpy.typing import NDArray
 from springbench.harness.scenes.scene_builder import Scene
 from springbench.harness.simulation.adaptive_stepping import (
     StepObserver,
@@ -22,7 +23,6 @@ from springbench.harness.simulation.adaptive_stepping import (
     Trajectory,
     build_budget_error,
     share_frame_seconds,
-    stack_motions,
 )
 from springbench.harness.simulation.time_loop import (
     MotionState,
@@ -32,6 +32,9 @@ from springbench.harness.simulation.time_loop import (
 )
 from springbench.solvers.model.integrators import Motion
 from springbench.solvers.model.step_problem import Positions, Solver, StepProblem, Unsupported
+
+_CALL_SECONDS = 1e-3
+"""Wall time [s] of a call that integrates several frames, in which the 30 us of the call itself do not count."""
 
 
 class _SubsteppingSolver(Protocol):
@@ -52,16 +55,23 @@ class _SubsteppingSolver(Protocol):
         """The number of factorisations in a tried step, 0 for explicit methods."""
         ...
 
-    def step(self, problem: StepProblem, h: float | None = None) -> tuple[Positions, Positions, Sequence[float]]:
-        """Integrate one frame.
+    def integrate_frames(
+        self, problem: StepProblem, num_frames: int = 1, h: float | None = None
+    ) -> tuple[tuple[Positions, Positions], NDArray[np.float64]]:
+        """Integrate frames with the same external force and pin targets.
 
         Args:
-            problem: step problem of the frame.
+            problem: step problem of the first frame.
+            num_frames: largest number of frames.
             h: first step size [s].
 
         Returns:
-            Positions [m] and velocities [m/s] at the frame's end, and the number of accepted steps, the
-            number of rejected steps and the size of the last step [s].
+            Positions [m] and velocities [m/s] at the ends of k frames, at least one, each (k, n, 3), and (k, 4): the
+            number of accepted steps, that of rejected steps, the size of the last step [s] and the length of the
+            frame [s].
+
+        Raises:
+            RuntimeError: the first frame cannot be finished.
         """
         ...
 
@@ -128,32 +138,33 @@ class _Substepper(Stepper):
         cpu = thread_time()
         scene, ready, pieces = self._prepare_pieces(setting)
         state, began = build_initial_state(scene), perf_counter()
-        reached = list[float]()
-        seen, h, step_stats = [state.motion], None, np.zeros((self.frames * pieces, 3))
-        for k in range(len(step_stats)):
+        motions, step_stats = [(state.motion.positions[None], state.motion.velocity[None])], list[NDArray[np.float64]]()
+        reached, h, count, is_steady = list[float](), None, self.frames * pieces, observe is None and _is_steady(scene)
+        while (k := state.index) < count:
             stated = build_problem(scene, state, "previous")
+            wanted = min(count - k, _choose_num_frames(reached)) if is_steady else 1
             try:
-                p, v, each = ready.step(stated, h)
+                (p, v), each = ready.integrate_frames(stated, wanted, h)
             except RuntimeError as error:
                 raise StepSizeUnderflow(
                     f"frame {k // pieces + 1}, after {scene.compute_time(k):.6g} s: {error}"
                 ) from error
-            step_stats[k] = each[:3]
-            h, state = float(step_stats[k, 2]), MotionState(Motion(p, v), None, k + 1)
+            step_stats.append(each)
+            h, state = float(each[-1, 2]), MotionState(Motion(p[-1], v[-1]), None, k + len(each))
             if observe:
-                observe(scene, build_integrated_step(stated, state), scene.compute_time(k + 1))
-            if (k + 1) % pieces == 0:
-                seen.append(state.motion)
-                reached.append(perf_counter() - began)
+                observe(scene, build_integrated_step(stated, state), scene.compute_time(state.index))
+            if state.index % pieces == 0:
+                motions.append((p, v))
+                reached += [perf_counter() - began] * len(each)
             if thread_time() - cpu > cpu_limit:
-                raise build_budget_error(cpu_limit, scene.compute_time(k + 1))
-        accepted, rejected = (int(count) for count in step_stats[:, :2].sum(axis=0))
+                raise build_budget_error(cpu_limit, scene.compute_time(state.index))
+        accepted, rejected = (int(number) for number in np.concatenate(step_stats)[:, :2].sum(axis=0))
         evaluations = (accepted + rejected) * ready.num_evaluations
-        mean = scene.system.time_step * len(step_stats) / accepted
+        mean = scene.system.time_step * count / accepted
         counts = accepted, rejected, (accepted + rejected) * ready.num_factorisations, evaluations
-        return Trajectory(
-            *stack_motions(seen), *counts, (mean, mean), reached[-1], share_frame_seconds(reached), thread_time() - cpu
-        )
+        positions, velocities = (np.concatenate(parts) for parts in zip(*motions, strict=True))
+        shared, processor = share_frame_seconds(reached), thread_time() - cpu
+        return Trajectory(positions, velocities, *counts, (mean, mean), reached[-1], shared, processor)
 
     @abstractmethod
     def _prepare_pieces(self, setting: float) -> tuple[Scene, _SubsteppingSolver, int]:
@@ -209,3 +220,13 @@ def _list_time_dependence(scene: Scene) -> list[str]:
         ("moving pins", scene.pin_motions),
     )
     return [what for what, some in there if some]
+
+
+def _is_steady(scene: Scene) -> bool:
+    """Return whether frames differ by their start only, with no velocity filter between them."""
+    return not (_list_time_dependence(scene) or scene.velocity_filters)
+
+
+def _choose_num_frames(reached: Sequence[float]) -> int:
+    """Return the number of frames of the next call, from the times [s] at which earlier ones ended."""
+    return max(1, int(_CALL_SECONDS * len(reached) / reached[-1])) if reached else 1

@@ -46,7 +46,7 @@ from springbench.harness.simulation.adaptive_stepping import (
 from springbench.harness.simulation.substepping import AdaptiveSubstepper, FixedSubstepper
 from springbench.harness.simulation.time_loop import prepare, simulate_scene
 from springbench.solvers.methods.newton.newton_direct import NewtonSolver
-from springbench.solvers.methods.time_stepping.explicit_integrators import VelocityVerlet
+from springbench.solvers.methods.time_stepping.explicit_integrators import Tsitouras5, VelocityVerlet
 from springbench.solvers.methods.time_stepping.rosenbrock import Rodas
 from springbench.solvers.model.integrators import Motion
 from springbench.solvers.model.step_problem import StopRule
@@ -339,6 +339,22 @@ def test_fixed_steps_are_no_longer_than_is_stable_and_as_short_as_the_error_requ
     )  # whole numbers of steps in a frame
     errors = [truth.measure_error(0, path.positions[-1]) for path in (coarse, fine)]
     assert errors[1] == pytest.approx(0.01 * errors[0], rel=0.2)
+
+
+@pytest.mark.parametrize("solver", [VelocityVerlet(), Tsitouras5()], ids=["velocity-verlet", "tsitouras-5"])
+def test_frames_that_are_integrated_together_are_those_of_an_observed_motion(solver):
+    scene, seen = build_scene(SWINGING, 5, "substepping"), list[Motion]()
+    stepper = (
+        FixedSubstepper(scene, solver, FRAMES, lambda h: build_scene(SWINGING.with_time_step(h), 5, "substepping"))
+        if isinstance(solver, VelocityVerlet)
+        else AdaptiveSubstepper(scene, solver, FRAMES)
+    )
+    setting = stepper.initial_setting(1e-5)
+    path = stepper.integrate_motion(setting)
+    stepper.integrate_motion(setting, observe=lambda scene, step, time: seen.append(step.state.motion))
+    np.testing.assert_array_equal(path.positions[1:], [motion.positions for motion in seen])
+    np.testing.assert_array_equal(path.velocities[1:], [motion.velocity for motion in seen])
+    assert sum(path.frame_seconds) == pytest.approx(path.wall_seconds)
 
 
 def test_forces_of_the_speed_are_constant_within_parts_of_a_frame_as_short_as_the_error_requires():

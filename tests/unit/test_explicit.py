@@ -24,8 +24,15 @@ from springbench.harness.scenes.mesh.chain_mesh import ChainMesh
 from springbench.harness.scenes.mesh.grid_mesh import GridMesh
 from springbench.harness.scenes.scene_builder import Scene, build_scene
 from springbench.harness.scenes.scene_spec import SceneSpec
-from springbench.harness.simulation.time_loop import MotionState, build_initial_state, prepare, simulate_scene
+from springbench.harness.simulation.time_loop import (
+    MotionState,
+    build_initial_state,
+    build_problem,
+    prepare,
+    simulate_scene,
+)
 from springbench.solvers.methods.newton.newton_direct import NewtonSolver
+from springbench.solvers.methods.time_stepping import explicit_integrators
 from springbench.solvers.methods.time_stepping.explicit_forces import estimate_max_frequency
 from springbench.solvers.methods.time_stepping.explicit_integrators import PreparedExplicit
 from springbench.solvers.methods.time_stepping.explicit_tableaus import (
@@ -34,6 +41,7 @@ from springbench.solvers.methods.time_stepping.explicit_tableaus import (
     RUNGE_KUTTA_4,
     TSITOURAS_5,
     VELOCITY_VERLET,
+    integrate_drag,
 )
 from springbench.solvers.model.integrators import Motion
 from springbench.solvers.model.step_problem import StopRule, Unsupported
@@ -167,6 +175,45 @@ def test_the_same_steps_give_the_same_bits(name):
     scene = build_unit_scene(SOFT, GravityEffect(), FIRST_PIN)
     one, two = (run(scene, prepare_explicit(name, scene), 4) for _ in "ab")
     np.testing.assert_array_equal(np.array(one), np.array(two))
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_frames_of_one_call_are_those_of_single_calls(name):
+    scene = build_unit_scene(SOFT, GravityEffect(), FIRST_PIN, EtherDragEffect(decay_rate=3.0))
+    ready, state, h, single = prepare_explicit(name, scene), build_initial_state(scene), None, list[Any]()
+    problem = build_problem(scene, state, "previous")
+    for index in range(4):
+        (p, v), step_stats = ready.integrate_frames(build_problem(scene, state, "previous"), 1, h)
+        h, state = step_stats[0, 2], MotionState(Motion(p[0], v[0]), None, index + 1)
+        single.append((p[0], v[0], step_stats[0]))
+    (p, v), step_stats = ready.integrate_frames(problem, 4)
+    for found, expected in zip((p, v, step_stats), zip(*single, strict=True), strict=True):
+        np.testing.assert_array_equal(found, expected)
+
+
+def test_frames_before_one_that_takes_too_many_steps_are_returned(monkeypatch):
+    scene = build_unit_scene(SOFT, GravityEffect(), FIRST_PIN, time_step=0.05)
+    p = scene.mesh.rest_positions
+    problem = build_problem(scene, MotionState(Motion(p, 0.0 * p), None, 0), "previous")
+    motions, step_stats = prepare_explicit("tsitouras-5", scene).integrate_frames(problem, 40)
+    tried = step_stats[:, :2].sum(axis=1)
+    limit = tried[0]
+    done = int(np.argmax(tried > limit))
+    assert done > 0
+    monkeypatch.setattr(explicit_integrators, "compute_max_steps", lambda count, tolerance: limit)
+    some, _ = prepare_explicit("tsitouras-5", scene).integrate_frames(problem, 40)
+    np.testing.assert_array_equal(some.positions, motions.positions[:done])
+
+
+def test_one_drag_rate_for_all_vertices_gives_the_bits_of_a_rate_for_each():
+    scene = build_unit_scene(SOFT, GravityEffect(), FIRST_PIN, EtherDragEffect(decay_rate=2.0))  # 2 m/m is exact
+    problem = build_problem(scene, build_initial_state(scene), "previous")
+    one, each = (prepare_explicit("blanes-moan-4", scene) for _ in "ab")
+    steps = one._splitting_steps
+    assert steps.velocity_factor.shape[1] == 1
+    decay, gain = integrate_drag(BLANES_MOAN_4.kicks, steps.step_size, one.explicit_forces.frame_forces.drag_rate)
+    each.__dict__["_splitting_steps"] = steps._replace(velocity_factor=decay, gained=gain)
+    np.testing.assert_array_equal(one.integrate_frames(problem, 3)[0], each.integrate_frames(problem, 3)[0])
 
 
 def test_the_largest_frequency_is_bounded_closely():

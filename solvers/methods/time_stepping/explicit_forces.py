@@ -16,6 +16,11 @@ from springbench.solvers.kernels.padding_coordinate import PADDING_COORDINATE
 from springbench.solvers.kernels.quadratic_form_kernels import QuadraticForm
 from springbench.solvers.kernels.spring_local_step import SpringPackets
 from springbench.solvers.linalg.memory import allocate_aligned
+from springbench.solvers.methods.time_stepping.explicit_integrator_kernels import (
+    FrameForces,
+    MotionRows,
+    UniformPinMotion,
+)
 from springbench.solvers.model.energies.quadratic_energy import Quadratic, drag_of_vertices
 from springbench.solvers.model.energies.spring_energy import Springs
 from springbench.solvers.model.step_problem import Positions, System, Unsupported, is_lagged
@@ -56,19 +61,15 @@ class ExplicitForces:
 
     Attributes:
         springs: all springs.
-        spring_packets: packets of the springs at unpinned vertices.
-        form_pairs, form_weight, form_vertex_weight: quadratic form, as in `FrameForces`.
         drag_rate: rate of the drag of each vertex (n,) [1/s], 0 for pinned ones.
-        constant_force: force of the form at the origin (n, 3) [N].
+        frame_forces: the forces for the kernels.
+        motion_rows: scratch of a motion for the kernels.
     """
 
     springs: Springs
-    spring_packets: SpringPackets
-    form_pairs: NDArray[np.int64]
-    form_weight: NDArray[np.float64]
-    form_vertex_weight: NDArray[np.float64]
     drag_rate: NDArray[np.float64]
-    constant_force: Positions
+    frame_forces: FrameForces
+    motion_rows: MotionRows
 
     @classmethod
     def from_system(cls, system: System, solver: str) -> ExplicitForces:
@@ -97,17 +98,29 @@ class ExplicitForces:
                 )
         form = QuadraticForm.from_matrix(csr_array(reduce(add, forms))) if forms else QuadraticForm.empty_form()
         part = np.where(system.unpinned_mask, 0, -1)
-        bundles, _ = SpringPackets.from_springs(springs, np.arange(n), part, 1, n, n + 1)
+        packets, _ = SpringPackets.from_springs(springs, np.arange(n), part, 1, n, n + 1)
         drag = np.divide(drag, system.mass, out=np.zeros(n), where=system.unpinned_mask)
-        return cls(
-            springs,
-            bundles,
+        pins, zero = system.pins.vertices.copy(), np.zeros((n, 3))
+        forces = FrameForces(
+            packets,
+            packets.build_right_hand_side(np.zeros(n + 2)),
+            load,
             form.pairs,
             form.pair_weight,
             form.vertex_weight if form.vertex_weight.any() else form.vertex_weight[:0],
-            drag,
-            load,
+            _expand_to_rows(np.divide(1.0, system.mass, out=np.zeros(n), where=system.unpinned_mask)),
+            _expand_to_rows(drag),
+            UniformPinMotion(pins, *np.zeros((2, len(pins), 3))),
         )
+        return cls(springs, drag, forces, MotionRows(pad_rows(zero, pad_far=True), pad_rows(zero), pad_rows(zero)))
+
+
+def _expand_to_rows(of_vertices: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Repeat the value of each vertex for the three coordinates of its row.
+
+    The fourth number of a row and the padding rows are zero.
+    """
+    return pad_rows(np.repeat(of_vertices[:, None], 3, axis=1))
 
 
 def pad_rows(x: Positions, *, pad_far: bool = False) -> NDArray[np.float64]:

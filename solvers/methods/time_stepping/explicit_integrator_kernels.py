@@ -1,8 +1,9 @@
-"""Compiled explicit integration of a frame: splitting methods, and Runge-Kutta methods with adaptive step size.
+"""Compiled explicit integration of frames: splitting methods, and Runge-Kutta methods with adaptive step size.
 
     p' = v,    v' = M^-1 (f - grad E(p)) - c v
 
-Positions, velocities and accelerations are in rows of four. `FrameForces` has the data that are constant in a frame.
+Inside a frame, positions, velocities and accelerations are in rows of four. External forces and the targets of the pins
+are the same in all frames of a call.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from springbench.solvers.model.integrators.step_size_controller import (
     compute_rejection_factor,
 )
 from springbench.solvers.model.step_problem import Positions
+from springbench.solvers.simd.spring_packets import LANES, RHS_STRIDE
 
 MIN_STEP_FRACTION = 1e-10
 """Smallest step size relative to the frame; below it the integration is abandoned."""
@@ -27,30 +29,146 @@ MIN_STEP_FRACTION = 1e-10
 FloatArray = NDArray[np.float64]
 
 
+class UniformPinMotion(NamedTuple):
+    """The uniform motion of the pins in a frame.
+
+    Attributes:
+        vertices: pinned vertices (q,).
+        start, end: scratch: their positions (q, 3) [m].
+    """
+
+    vertices: NDArray[np.int64]
+    start: Positions
+    end: Positions
+
+
 class FrameForces(NamedTuple):
-    """The forces of a frame.
+    """The forces of a system, and the motion of its pins.
 
     Attributes:
         spring_packets: packets of the springs at unpinned vertices.
-        right_hand_side: constant force [N], in the layout of `SpringPackets.build_right_hand_side`.
+        right_hand_side: scratch: constant force [N], in the layout of `SpringPackets.build_right_hand_side`.
+        form_force: force of the quadratic form at the origin (n, 3) [N].
         form_pairs, form_weight, form_vertex_weight: quadratic form as in `QuadraticForm`, (k, 2), (k,) and (n,), or
             empty.
         inverse_mass: 1/m [1/kg] in rows of four, 0 for pinned vertices.
         drag_rate: c [1/s] in rows of four.
-        pinned_vertices: vertices (q,) that move uniformly from `pin_start` to `pin_end`.
-        pin_start, pin_end: positions of the pins (q, 3) [m].
+        pins: motion of the pins.
     """
 
     spring_packets: SpringPackets
     right_hand_side: FloatArray
+    form_force: FloatArray
     form_pairs: NDArray[np.int64]
     form_weight: FloatArray
     form_vertex_weight: FloatArray
     inverse_mass: FloatArray
     drag_rate: FloatArray
-    pinned_vertices: NDArray[np.int64]
-    pin_start: Positions
-    pin_end: Positions
+    pins: UniformPinMotion
+
+
+class FrameStart(NamedTuple):
+    """The start of the first frame, and what is constant in all frames.
+
+    Attributes:
+        positions: positions (n, 3) [m].
+        velocity: velocities (n, 3) [m/s].
+        external_force: external force (n, 3) [N].
+        pin_targets: positions of the pins at the end of each frame (q, 3) [m].
+    """
+
+    positions: Positions
+    velocity: Positions
+    external_force: Positions
+    pin_targets: Positions
+
+
+class FrameMotions(NamedTuple):
+    """The motion at the end of each frame.
+
+    Attributes:
+        positions: positions (k, n, 3) [m].
+        velocities: velocities (k, n, 3) [m/s].
+    """
+
+    positions: Positions
+    velocities: Positions
+
+
+class MotionRows(NamedTuple):
+    """Scratch of a motion, in rows of four.
+
+    Attributes:
+        p: positions [m]; its last row, of padding springs, is not overwritten.
+        v: velocities [m/s].
+        force: forces [N].
+    """
+
+    p: FloatArray
+    v: FloatArray
+    force: FloatArray
+
+
+@jit_inner
+def _start_motion(row_offset, right, form_force, pins, start, rows):
+    """Write the start of the first frame and the constant force to the scratch.
+
+    Args:
+        row_offset: offsets of the packets' vertices.
+        right: right-hand side of the packets, overwritten except for padding lanes.
+        form_force: force of the quadratic form at the origin (n, 3) [N].
+        pins: motion of the pins, of which the end is overwritten.
+        start: start of the first frame.
+        rows: motion, overwritten.
+    """
+    n = len(form_force)
+    for i in range(n):
+        for c in range(3):
+            rows.p[4 * i + c], rows.v[4 * i + c] = start.positions[i, c], start.velocity[i, c]
+        rows.p[4 * i + 3] = rows.v[4 * i + 3] = 0.0
+    for k in range(len(rows.force)):
+        rows.force[k] = 0.0
+    for lane in range(len(row_offset)):
+        i, at = row_offset[lane] // 4, RHS_STRIDE * (lane // LANES) + lane % LANES
+        if i < n:
+            for c in range(3):
+                right[at + LANES * c] = start.external_force[i, c] + form_force[i, c]
+    for q in range(len(pins.vertices)):
+        for c in range(3):
+            pins.end[q, c] = start.pin_targets[q, c]
+
+
+@jit_inner
+def _start_frame(pins, rows):
+    """Start the motion of the pins at their positions.
+
+    Args:
+        pins: motion of the pins, of which the start is overwritten.
+        rows: motion at the start of the frame; the velocities of the pins are set to zero.
+    """
+    for q in range(len(pins.vertices)):
+        i = 4 * pins.vertices[q]
+        for c in range(3):
+            pins.start[q, c], rows.v[i + c] = rows.p[i + c], 0.0
+
+
+@jit_inner
+def _end_frame(pins, frame_length, rows, p, v):
+    """Write the motion at the end of a frame.
+
+    Args:
+        pins: motion of the pins.
+        frame_length: length of the frame [s].
+        rows: motion at the end of the frame.
+        p: output: positions (n, 3) [m].
+        v: output: velocities (n, 3) [m/s], with those of the pins.
+    """
+    for i in range(len(p)):
+        for c in range(3):
+            p[i, c], v[i, c] = rows.p[4 * i + c], rows.v[4 * i + c]
+    for q in range(len(pins.vertices)):
+        for c in range(3):
+            v[pins.vertices[q], c] = (pins.end[q, c] - pins.start[q, c]) / frame_length
 
 
 @jit_inner
@@ -58,7 +176,7 @@ def add_forces(forces, p, out):
     """Add all forces except drag [N] at p to `out`.
 
     Args:
-        forces: forces of the frame.
+        forces: forces of the system.
         p: positions [m] in rows of four.
         out: forces [N] in rows of four, updated.
     """
@@ -81,7 +199,7 @@ def compute_acceleration(forces, p, out):
     """Write the acceleration [m/s^2] by all forces except drag to `out`.
 
     Args:
-        forces: forces of the frame.
+        forces: forces of the system.
         p: positions [m] in rows of four.
         out: acceleration [m/s^2] in rows of four, overwritten; zero for pinned vertices.
     """
@@ -93,79 +211,112 @@ def compute_acceleration(forces, p, out):
 
 
 @jit_inner
-def apply_pins(forces, fraction, p):
+def apply_pins(pins, fraction, p):
     """Move the pins to their positions at a fraction of the frame.
 
     Args:
-        forces: forces of the frame, with the motion of the pins.
+        pins: motion of the pins.
         fraction: time within the frame, 0 at its start and 1 at its end.
         p: positions [m] in rows of four, of which those of the pins are overwritten.
     """
-    for q in range(len(forces.pinned_vertices)):
+    for q in range(len(pins.vertices)):
         for c in range(3):
-            p[4 * forces.pinned_vertices[q] + c] = forces.pin_end[q, c] + (1.0 - fraction) * (
-                forces.pin_start[q, c] - forces.pin_end[q, c]
-            )
+            p[4 * pins.vertices[q] + c] = pins.end[q, c] + (1.0 - fraction) * (pins.start[q, c] - pins.end[q, c])
+
+
+class SplittingSteps(NamedTuple):
+    """The steps of a splitting method in a frame: drift 0, kick 0, ..., the last drift.
+
+    Attributes:
+        drifts: fractions of the step size (k + 1,).
+        velocity_factor, gained: decay of a velocity by a kick, and its gain per acceleration [s], exact for drag: (k,
+            rows), or (k, 1) if all vertices have the same drag.
+        num_steps: number of steps.
+        step_size: size of a step [s].
+        frame_length: length of the frame [s].
+    """
+
+    drifts: FloatArray
+    velocity_factor: FloatArray
+    gained: FloatArray
+    num_steps: int
+    step_size: float
+    frame_length: float
 
 
 @jit_inner
-def kick_and_drift(inverse, velocity_factor, gained, first, second, h, p, v, force):
-    """Apply one or two kicks to v and a drift to p; clear the force.
+def _kick_and_drift(steps, inverse, first, second, h, rows):
+    """Apply one or two kicks and a drift; clear the force.
 
     Args:
+        steps: steps of the frame, with the coefficients of the kicks.
         inverse: 1/m [1/kg] in rows of four, 0 for pinned vertices.
-        velocity_factor, gained: decay of a velocity by each kick, and its gain per acceleration [s] (k, rows).
         first: index of the first kick.
         second: index of the second kick by the same force, negative for none.
         h: duration of the drift [s].
-        p: positions [m] in rows of four, updated.
-        v: velocities [m/s] in rows of four, updated.
-        force: force of the kicks [N] in rows of four; set to zero.
+        rows: motion and force of the kicks, updated; the force is set to zero.
     """
+    p, v, force, decay, gain = rows.p, rows.v, rows.force, steps.velocity_factor, steps.gained
+    if decay.shape[1] == 1:  # half of the arrays, which then stay in the first-level cache
+        first_decay, first_gain, second_decay, second_gain = (
+            decay[first, 0],
+            gain[first, 0],
+            decay[second, 0],
+            gain[second, 0],
+        )
+        for i in range(len(p)):
+            a = force[i] * inverse[i]
+            force[i] = 0.0
+            w = first_decay * v[i] + first_gain * a
+            if second >= 0:
+                w = second_decay * w + second_gain * a
+            v[i] = w
+            p[i] += h * w
+        return
     for i in range(len(p)):
         a = force[i] * inverse[i]
         force[i] = 0.0
-        w = velocity_factor[first, i] * v[i] + gained[first, i] * a
+        w = decay[first, i] * v[i] + gain[first, i] * a
         if second >= 0:
-            w = velocity_factor[second, i] * w + gained[second, i] * a
+            w = decay[second, i] * w + gain[second, i] * a
         v[i] = w
         p[i] += h * w
 
 
 @jit_kernel
-def run_splitting(forces, drifts, velocity_factor, gained, count, h, p, v, force):
-    """Run `count` steps of size h: drift 0, kick 0, ..., the last drift.
+def run_splitting(forces, steps, start, rows, motions):
+    """Integrate frames by a splitting method.
 
     If a step neither starts nor ends with a drift, its last kick and the first kick of the next step share one force.
-    The arrays p and v are overwritten with the result.
 
     Args:
-        forces: forces of the frame.
-        drifts: fractions of h (k + 1,).
-        velocity_factor, gained: decay of a velocity by a kick, and its gain per acceleration [s] (k, rows), exact for
-            drag.
-        count: number of steps.
-        h: step size [s].
-        p: positions [m].
-        v: velocities [m/s].
-        force: scratch, initially zero.
+        forces: forces of the system.
+        steps: steps of a frame.
+        start: start of the first frame.
+        rows: scratch of the motion.
+        motions: output: motion at the end of each frame.
     """
-    last = len(velocity_factor) - 1
+    pins, p, v, force = forces.pins, rows.p, rows.v, rows.force
+    drifts, count, h, last = steps.drifts, steps.num_steps, steps.step_size, len(steps.velocity_factor) - 1
     joined = drifts[0] == 0.0 and drifts[-1] == 0.0
-    for step in range(count):
-        gone = drifts[0]
-        if drifts[0] != 0.0:
-            for i in range(len(p)):
-                p[i] += drifts[0] * h * v[i]
-            apply_pins(forces, (step + gone) / count, p)
-        for k in range(1 if joined and step > 0 else 0, last + 1):
-            both = joined and k == last and step < count - 1
-            after = drifts[1] if both else drifts[k + 1]
-            add_forces(forces, p, force)
-            kick_and_drift(forces.inverse_mass, velocity_factor, gained, k, 0 if both else -1, after * h, p, v, force)
-            gone = 1 + after if both else gone + after
-            if after != 0.0:
-                apply_pins(forces, (step + gone) / count, p)
+    _start_motion(forces.spring_packets.row_offset, forces.right_hand_side, forces.form_force, pins, start, rows)
+    for frame in range(len(motions.positions)):
+        _start_frame(pins, rows)
+        for step in range(count):
+            gone = drifts[0]
+            if drifts[0] != 0.0:
+                for i in range(len(p)):
+                    p[i] += drifts[0] * h * v[i]
+                apply_pins(pins, (step + gone) / count, p)
+            for k in range(1 if joined and step > 0 else 0, last + 1):
+                both = joined and k == last and step < count - 1
+                after = drifts[1] if both else drifts[k + 1]
+                add_forces(forces, p, force)
+                _kick_and_drift(steps, forces.inverse_mass, k, 0 if both else -1, after * h, rows)
+                gone = 1 + after if both else gone + after
+                if after != 0.0:
+                    apply_pins(pins, (step + gone) / count, p)
+        _end_frame(pins, steps.frame_length, rows, motions.positions[frame], motions.velocities[frame])
 
 
 class TableauCoefficients(NamedTuple):
@@ -183,13 +334,13 @@ class TableauCoefficients(NamedTuple):
 
 
 class AdaptiveSteps(NamedTuple):
-    """The steps of a frame.
+    """The steps of a Runge-Kutta method in a frame.
 
     Attributes:
         frame_length: length of the frame [s].
         tolerance: rms error tolerance of a step [m].
         max_steps: maximum number of attempted steps.
-        initial_step: size of the first step [s].
+        initial_step: size of the first step [s]; an adaptive method starts a further frame with the last step size.
         controller: chooses the step sizes; an error order of 0 fixes them.
     """
 
@@ -275,50 +426,70 @@ def _step_error(forces, errors, span, at):
 
 
 @jit_kernel
-def integrate_adaptive(forces, stages, steps, p, v, at, step_stats):
-    """Integrate a frame by a Runge-Kutta method with adaptive step size.
+def integrate_adaptive(forces, stages, at, steps, start, rows, motions, step_stats):
+    """Integrate frames by a Runge-Kutta method with adaptive step size.
 
     An error of the velocity is multiplied by the length of the frame.
 
     Args:
-        forces: forces of the frame.
+        forces: forces of the system.
         stages: coefficients of the method.
-        steps: length and tolerance of the frame.
-        p: positions [m], overwritten with the result.
-        v: velocities [m/s], overwritten with the result.
-        at: scratch.
-        step_stats: output: accepted steps, rejected steps, last step size [s], time reached [s].
+        at: scratch of its stages.
+        steps: length and tolerance of a frame.
+        start: start of the first frame.
+        rows: scratch of the motion.
+        motions: output: motion at the end of each frame.
+        step_stats: output of each frame (k, 4): accepted steps, rejected steps, last step size [s], time reached [s].
+
+    Returns:
+        Number of frames that were integrated to their ends.
     """
-    free = 0
+    pins, p, v, free = forces.pins, rows.p, rows.v, 0
     for i in range(0, len(forces.inverse_mass), 4):
         free += 3 * (forces.inverse_mass[i] != 0.0)
-    frame, control, end = steps.frame_length, steps.controller, len(stages.a) - 1
-    t, before, h = 0.0, 1.0, steps.initial_step
-    step_stats[0] = step_stats[1] = 0.0
-    _evaluate_stage(forces, 0, p, v, at)
-    while t < frame:
-        last = t + 1.0000001 * h >= frame  # round-off must not leave a tiny last step
-        step = frame - t if last else h
-        for s in range(1, end + 1):
-            _write_stage(stages, s, step, p, v, at)
-            apply_pins(forces, (t + stages.stage_times[s] * step) / frame, at.q)
-            _evaluate_stage(forces, s, at.q, at.w, at)
-        error = step * np.sqrt(_step_error(forces, stages.error_weights, frame, at) / max(1, free)) / steps.tolerance
-        if error <= 1.0:
-            t = frame if last else t + step
-            for i in range(len(p)):
-                p[i], v[i] = at.q[i], at.w[i]
-                at.stage_velocities[0, i], at.stage_accelerations[0, i] = (
-                    at.stage_velocities[end, i],
-                    at.stage_accelerations[end, i],
-                )
-            step_stats[0] += 1.0
-            if control.error_order > 0.0:
-                h = choose_next_step_size(control, step, h, last, error, before)
-                before = error
-        else:  # also if the error is nan
-            step_stats[1] += 1.0
-            h = step * compute_rejection_factor(control, error)
-        if h < MIN_STEP_FRACTION * frame or step_stats[0] + step_stats[1] >= steps.max_steps:
-            break
-    step_stats[2], step_stats[3] = h, t
+    length, control, end = steps.frame_length, steps.controller, len(stages.a) - 1
+    first = steps.initial_step
+    _start_motion(forces.spring_packets.row_offset, forces.right_hand_side, forces.form_force, pins, start, rows)
+    for frame in range(len(step_stats)):
+        _start_frame(pins, rows)
+        t, before, h, accepted, rejected = 0.0, 1.0, first, 0.0, 0.0
+        _evaluate_stage(forces, 0, p, v, at)
+        while t < length:
+            last = t + 1.0000001 * h >= length  # round-off must not leave a tiny last step
+            step = length - t if last else h
+            for s in range(1, end + 1):
+                _write_stage(stages, s, step, p, v, at)
+                apply_pins(pins, (t + stages.stage_times[s] * step) / length, at.q)
+                _evaluate_stage(forces, s, at.q, at.w, at)
+            error = (
+                step * np.sqrt(_step_error(forces, stages.error_weights, length, at) / max(1, free)) / steps.tolerance
+            )
+            if error <= 1.0:
+                t = length if last else t + step
+                for i in range(len(p)):
+                    p[i], v[i] = at.q[i], at.w[i]
+                    at.stage_velocities[0, i], at.stage_accelerations[0, i] = (
+                        at.stage_velocities[end, i],
+                        at.stage_accelerations[end, i],
+                    )
+                accepted += 1.0
+                if control.error_order > 0.0:
+                    h = choose_next_step_size(control, step, h, last, error, before)
+                    before = error
+            else:  # also if the error is nan
+                rejected += 1.0
+                h = step * compute_rejection_factor(control, error)
+            if h < MIN_STEP_FRACTION * length or accepted + rejected >= steps.max_steps:
+                break
+        step_stats[frame, 0], step_stats[frame, 1], step_stats[frame, 2], step_stats[frame, 3] = (
+            accepted,
+            rejected,
+            h,
+            t,
+        )
+        if t < length:
+            return frame
+        _end_frame(pins, length, rows, motions.positions[frame], motions.velocities[frame])
+        if control.error_order > 0.0:
+            first = min(length, h)
+    return len(step_stats)

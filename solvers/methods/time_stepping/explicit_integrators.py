@@ -20,16 +20,17 @@ from numpy.typing import NDArray
 from springbench.solvers.iteration import vertex_terms
 from springbench.solvers.iteration.iterative_solver import IterativeSolver, SolverState
 from springbench.solvers.iteration.solver_info import Citation, SolverInfo
-from springbench.solvers.jit.typed_kernel import TypedKernel
+from springbench.solvers.jit.typed_kernel import TypedKernel, as_kernel_array
 from springbench.solvers.methods.time_stepping.explicit_forces import (
     ExplicitForces,
     SingleIterateState,
     estimate_max_frequency,
-    pad_rows,
 )
 from springbench.solvers.methods.time_stepping.explicit_integrator_kernels import (
     AdaptiveSteps,
-    FrameForces,
+    FrameMotions,
+    FrameStart,
+    SplittingSteps,
     StageScratch,
     TableauCoefficients,
     integrate_adaptive,
@@ -285,23 +286,6 @@ class PreparedExplicit(PreparedSubstepping, IterativeSolver):
         """Description of the chosen substeps."""
         return self.substep_choice.description
 
-    @cached_property
-    def _inverse_mass_rows(self) -> NDArray[np.float64]:
-        """1/m [1/kg] in rows of four, 0 for pinned vertices."""
-        s = self.system
-        return _expand_to_rows(np.divide(1.0, s.mass, out=np.zeros(s.num_vertices), where=s.unpinned_mask))
-
-    @cached_property
-    def _drag_rate_rows(self) -> NDArray[np.float64]:
-        return _expand_to_rows(self.explicit_forces.drag_rate)
-
-    @cached_property
-    def _kick_factors(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Decay and gain of the velocities by the kicks of a substep."""
-        assert isinstance(self.method, SplittingMethod)
-        h = self.system.time_step / self.substep_choice.num_substeps
-        return integrate_drag(self.method.kicks, h, self._drag_rate_rows)
-
     def init_state(self, problem: StepProblem, initial_guess: Positions) -> SolverState:
         """Start a solve whose only iteration is the whole step.
 
@@ -309,90 +293,94 @@ class PreparedExplicit(PreparedSubstepping, IterativeSolver):
             problem: step that is integrated from its start.
             initial_guess: not used.
         """
-        return SingleIterateState(*self.step(problem)[:2])
+        motions, _ = self.integrate_frames(problem)
+        return SingleIterateState(motions.positions[0], motions.velocities[0])
 
-    def step(self, problem: StepProblem, h: float | None = None) -> tuple[Positions, Positions, NDArray[np.float64]]:
-        """Integrate one step.
+    def integrate_frames(
+        self, problem: StepProblem, num_frames: int = 1, h: float | None = None
+    ) -> tuple[FrameMotions, NDArray[np.float64]]:
+        """Integrate frames with the same external force and pin targets.
 
         Args:
-            problem: the step problem.
+            problem: step problem of the first frame.
+            num_frames: number of frames.
             h: first substep [s] of an adaptive method; by default from the largest frequency.
 
         Returns:
-            Positions and velocities (n, 3) at the end of the step, and the statistics of `integrate_adaptive`.
+            Motions at the ends of the frames, up to one that cannot be finished, and their statistics, as in
+            `integrate_adaptive`.
+
+        Raises:
+            RuntimeError: the first frame cannot be finished.
         """
-        s, pins, start, frame = self.system, self.system.pins.vertices, problem.step_start, self.system.time_step
-        begin, end = np.ascontiguousarray(start.positions[pins]), problem.pin_targets.copy()
-        p, v = pad_rows(start.positions, pad_far=True), pad_rows(start.velocity)
-        v.reshape(-1, 4)[pins] = 0.0
-        force = pad_rows(problem.external_force + self.explicit_forces.constant_force)
-        right, x = (
-            self.explicit_forces.spring_packets.build_right_hand_side(np.zeros(s.num_vertices + 2), force),
-            self.explicit_forces,
+        begin, shape = problem.step_start, (num_frames, self.system.num_vertices, 3)
+        start = FrameStart(
+            as_kernel_array(begin.positions),
+            as_kernel_array(begin.velocity),
+            as_kernel_array(problem.external_force),
+            as_kernel_array(problem.pin_targets),
         )
-        forces = FrameForces(
-            x.spring_packets,
-            right,
-            x.form_pairs,
-            x.form_weight,
-            x.form_vertex_weight,
-            self._inverse_mass_rows,
-            self._drag_rate_rows,
-            pins.copy(),
-            begin,
-            end,
-        )
-        count = self.substep_choice.num_substeps
-        step_stats = np.array([count, 0.0, frame / count, frame])
+        motions, step_stats = FrameMotions(np.empty(shape), np.empty(shape)), np.empty((num_frames, 4))
+        forces, rows = self.explicit_forces.frame_forces, self.explicit_forces.motion_rows
         if isinstance(self.method, SplittingMethod):
-            self._compose(forces, self.method, p, v)
-        else:
-            self._integrate(forces, self.method, p, v, h, step_stats)
-        velocity = v.reshape(-1, 4)[: s.num_vertices, :3].copy()
-        velocity[pins] = (end - begin) / frame
-        return p.reshape(-1, 4)[: s.num_vertices, :3].copy(), velocity, step_stats
+            steps = self._splitting_steps
+            self._run_splitting.call(forces, steps, start, rows, motions)
+            step_stats[:] = steps.num_steps, 0.0, steps.step_size, steps.frame_length
+            return motions, step_stats
+        done = self._integrate_adaptive.call(
+            forces, *self._tableau, self._choose_steps(h), start, rows, motions, step_stats
+        )
+        if not done:
+            accepted, rejected, last, reached = step_stats[0]
+            tolerance, frame = self.substep_choice.tolerance, self.system.time_step
+            raise RuntimeError(format_step_failure(accepted + rejected, last, reached, frame, tolerance))
+        return FrameMotions(motions.positions[:done], motions.velocities[:done]), step_stats[:done]
 
     @cached_property
     def _run_splitting(self) -> TypedKernel:
         return TypedKernel(run_splitting)
 
-    def _compose(
-        self, forces: FrameForces, method: SplittingMethod, p: NDArray[np.float64], v: NDArray[np.float64]
-    ) -> None:
-        count = self.substep_choice.num_substeps
-        h = self.system.time_step / count
-        self._run_splitting.call(forces, method.drifts, *self._kick_factors, count, h, p, v, np.zeros_like(v))
+    @cached_property
+    def _integrate_adaptive(self) -> TypedKernel:
+        return TypedKernel(integrate_adaptive)
 
-    def _integrate(
-        self,
-        forces: FrameForces,
-        method: ExplicitTableau,
-        p: NDArray[np.float64],
-        v: NDArray[np.float64],
-        h: float | None,
-        step_stats: NDArray[np.float64],
-    ) -> None:
-        frame, taken, fixed = self.system.time_step, self.substep_choice, not self.substep_choice.tolerance
-        first = (
-            frame / taken.num_substeps
-            if fixed
-            else min(frame, h or (1.0 / taken.fastest_rate if taken.fastest_rate else frame))
+    @cached_property
+    def _splitting_steps(self) -> SplittingSteps:
+        assert isinstance(self.method, SplittingMethod)
+        frame, count = float(self.system.time_step), self.substep_choice.num_substeps
+        h = frame / count
+        decay, gain = integrate_drag(self.method.kicks, h, self.explicit_forces.frame_forces.drag_rate)
+        free, rates = np.flatnonzero(self.system.unpinned_mask), self.explicit_forces.drag_rate
+        if len(free) and (rates[free] == rates[free[0]]).all():  # the velocity of a pinned vertex is zero
+            decay, gain = (np.array(x[:, 4 * free[0]])[:, None] for x in (decay, gain))
+        return SplittingSteps(self.method.drifts, decay, gain, count, h, frame)
+
+    @cached_property
+    def _tableau(self) -> tuple[TableauCoefficients, StageScratch]:
+        """Coefficients of a Runge-Kutta method, and its scratch."""
+        method = self.method
+        assert isinstance(method, ExplicitTableau)
+        weights = method.error_weights if self.substep_choice.tolerance else np.zeros((1, len(method.a)))
+        return (
+            TableauCoefficients(method.a, method.stage_times, weights),
+            StageScratch.from_sizes(len(method.a), len(self.explicit_forces.motion_rows.p)),
         )
-        errors = np.zeros((1, len(method.a))) if fixed else method.error_weights
-        most = float(compute_max_steps(taken.num_substeps, taken.tolerance))
-        controller = build_pi_controller(method.error_exponent, _MAX_STEP_FACTOR, _FAILURE_FACTOR)
-        steps = AdaptiveSteps(frame, taken.tolerance or 1.0, most, first, controller)
-        stages = TableauCoefficients(method.a, method.stage_times, errors)
-        integrate_adaptive(forces, stages, steps, p, v, StageScratch.from_sizes(len(method.a), len(p)), step_stats)
-        if step_stats[3] < frame:
-            raise RuntimeError(
-                format_step_failure(step_stats[0] + step_stats[1], step_stats[2], step_stats[3], frame, taken.tolerance)
-            )
 
+    def _choose_steps(self, h: float | None) -> AdaptiveSteps:
+        """Choose the steps of a Runge-Kutta method, of which the first has size h [s]."""
+        steps = self._adaptive_steps
+        return steps._replace(initial_step=min(steps.frame_length, h)) if h and self.substep_choice.tolerance else steps
 
-def _expand_to_rows(of_vertices: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Repeat the value of each vertex for the three coordinates of its row.
-
-    The fourth number of a row and the padding rows are zero.
-    """
-    return pad_rows(np.repeat(of_vertices[:, None], 3, axis=1))
+    @cached_property
+    def _adaptive_steps(self) -> AdaptiveSteps:
+        """The steps of a Runge-Kutta method, the first one of its default size."""
+        assert isinstance(self.method, ExplicitTableau)
+        frame, taken = float(self.system.time_step), self.substep_choice
+        first = min(frame, 1.0 / taken.fastest_rate if taken.fastest_rate else frame)
+        return AdaptiveSteps(
+            frame,
+            taken.tolerance or 1.0,
+            float(compute_max_steps(taken.num_substeps, taken.tolerance)),
+            first if taken.tolerance else frame / taken.num_substeps,
+            build_pi_controller(self.method.error_exponent, _MAX_STEP_FACTOR, _FAILURE_FACTOR),
+        )

@@ -241,21 +241,28 @@ class PreparedRosenbrock(IterativeSolver):
             problem: step that is integrated from its start.
             initial_guess: not used.
         """
-        return SingleIterateState(*self.step(problem)[:2])
+        return SingleIterateState(*self._integrate_frame(problem, None)[:2])
 
-    def step(self, problem: StepProblem, h: float | None = None) -> tuple[Positions, Positions, AdaptiveStepStats]:
+    def integrate_frames(
+        self, problem: StepProblem, num_frames: int = 1, h: float | None = None
+    ) -> tuple[tuple[Positions, Positions], NDArray[np.float64]]:
         """Integrate one frame; exact pins move at constant velocity.
 
         Args:
             problem: the step problem.
+            num_frames: not used.
             h: first step size [s] of an adaptive method, the frame by default.
 
         Returns:
-            Positions and velocities (n, 3) at the end of the frame, and step statistics.
+            Positions and velocities (1, n, 3) at the end of the frame, and its `AdaptiveStepStats` (1, 4).
 
         Raises:
             RuntimeError: if no step size meets the error tolerance.
         """
+        p, v, step_stats = self._integrate_frame(problem, h)
+        return (p[None], v[None]), np.array([step_stats], float)
+
+    def _integrate_frame(self, problem: StepProblem, h: float | None) -> tuple[Positions, Positions, AdaptiveStepStats]:
         frame = self.system.time_step
         within = _FrameIntegration(self, problem)
         p, v = within.initial_motion()
