@@ -212,7 +212,7 @@ def test_one_drag_rate_for_all_vertices_gives_the_bits_of_a_rate_for_each():
     steps = one._splitting_steps
     assert steps.velocity_factor.shape[1] == 1
     decay, gain = integrate_drag(BLANES_MOAN_4.kicks, steps.step_size, one.explicit_forces.frame_forces.drag_rate)
-    each.__dict__["_splitting_steps"] = steps._replace(velocity_factor=decay, gained=gain)
+    vars(each)["_splitting_steps"] = steps._replace(velocity_factor=decay, gained=gain)
     np.testing.assert_array_equal(one.integrate_frames(problem, 3)[0], each.integrate_frames(problem, 3)[0])
 
 
