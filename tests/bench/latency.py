@@ -177,14 +177,14 @@ LATENCY_ROWS = {
         0.3e-3,
         (*_IN_PROCESS, "chain-motion"),
         value_key="seconds",
-        limit="one half, before the first step, selects the compiled code and computes factors; an eighth steps",
+        limit="one half, before the first step, selects the compiled code and computes factors; an eighth takes steps",
     ),
     "verlet-substep": LatencyRow(
         "velocity Verlet, cloth of 17 a side, a substep",
         4e-6,
         (*_IN_PROCESS, "verlet-substep"),
         value_key="seconds",
-        limit="two thirds the compiled loop over springs, whose bits are fixed; a fifth Python, once a frame",
+        limit="three fifths the compiled loop over springs, whose bits are fixed; a quarter Python, once a frame",
     ),
     "overhead-share": LatencyRow(
         "share of processor time outside timed passes, 100 short runs",
