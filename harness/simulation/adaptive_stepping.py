@@ -93,7 +93,8 @@ class Trajectory:
         num_iterations: number of iterations of the steps' solves; force evaluations of a solver with substeps.
         step_size_range: smallest and largest step size [s]; the mean size in both entries for a solver with substeps.
         wall_seconds: wall time [s], without the preparation of the first steps.
-        frame_seconds: wall time (k,) [s] in which each frame was computed; frames of one step share its time equally.
+        frame_seconds: wall time (k,) [s] in which each frame was computed; frames of one step or call share its time
+            equally.
         cpu_seconds: processor time [s] of this thread, including preparation.
     """
 
@@ -362,11 +363,12 @@ def _is_solved(solution: Solution, atol: float) -> bool:
 def share_frame_seconds(reached: Sequence[float]) -> tuple[float, ...]:
     """Return the wall time [s] of each frame from the cumulative times.
 
-    Frames of one step share its time equally.
+    Frames of one step or call share its time equally.
     """
     gone = np.diff(np.array(reached), prepend=0.0)
     steps = np.cumsum(gone > 0.0)
-    return tuple(float(gone[steps == step].mean()) for step in steps)
+    steps -= steps[0]
+    return tuple((np.bincount(steps, gone) / np.bincount(steps))[steps].tolist())
 
 
 def stack_motions(motions: Sequence[Motion]) -> tuple[Positions, Positions]:

@@ -34,7 +34,7 @@ from springbench.solvers.model.integrators import Motion
 from springbench.solvers.model.step_problem import Positions, Solver, StepProblem, Unsupported
 
 _CALL_SECONDS = 1e-3
-"""Wall time [s] of a call that integrates several frames, in which the 30 us of the call itself do not count."""
+"""Wall time [s] of a call that integrates several frames; the call itself takes 30 us."""
 
 
 class _SubsteppingSolver(Protocol):
@@ -228,5 +228,5 @@ def _is_steady(scene: Scene) -> bool:
 
 
 def _choose_num_frames(reached: Sequence[float]) -> int:
-    """Return the number of frames of the next call, from the times [s] at which earlier ones ended."""
+    """Return the number of frames of the next call, given when earlier ones ended [s]."""
     return max(1, int(_CALL_SECONDS * len(reached) / reached[-1])) if reached else 1

@@ -225,7 +225,9 @@ def apply_pins(pins, fraction, p):
 
 
 class SplittingSteps(NamedTuple):
-    """The steps of a splitting method in a frame: drift 0, kick 0, ..., the last drift.
+    """The steps of a splitting method in a frame.
+
+    Drifts and kicks alternate, from drift 0 and kick 0 to the last drift.
 
     Attributes:
         drifts: fractions of the step size (k + 1,).
