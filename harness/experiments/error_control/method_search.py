@@ -65,7 +65,7 @@ _MIN_TIMED_SECONDS = 0.05
 """CPU time below which a trial is run twice, and the smaller time counts [s]."""
 _INITIAL_TIME_LIMIT, _TIME_LIMIT_GROWTH = 1.0, 4.0
 """Time limit of a method until one has finished [s of CPU time], and its growth if none has."""
-_MIN_TIME_LIMIT, _TIME_LIMIT_FACTOR = 0.02, 3.0
+_MIN_TIME_LIMIT, _TIME_LIMIT_FACTOR = 0.01, 3.0
 """Smallest time limit of the other methods [s of CPU time], a few interruptions; its ratio to the cheapest time."""
 _MAX_COST_RATIO = 2.0
 """Factor on the predicted cost of the next method, above which that method is tried first."""
@@ -199,13 +199,13 @@ class _MethodSearch:
         return SearchResult(best, predicted, tolerance, closer, besides, note)
 
     @staticmethod
-    def _integrate_motion(method: Method, setting: float, time_limit: float = inf) -> Trial:
+    def _integrate_motion(method: Method, setting: float, time_limit: float = inf, *, is_timed: bool = False) -> Trial:
         """Run a method at a setting.
 
-        The method is run twice where the first run is too short to be timed.
+        To be timed it is run twice where the first run is short, unless it took more than half of the time limit.
         """
         paths = [method.stepper.integrate_motion(setting, cpu_limit=time_limit)]
-        if paths[0].cpu_seconds < _MIN_TIMED_SECONDS:
+        if is_timed and paths[0].cpu_seconds < min(_MIN_TIMED_SECONDS, 0.5 * time_limit):
             paths.append(method.stepper.integrate_motion(setting, cpu_limit=time_limit))
         return Trial(method, setting, min(paths, key=lambda path: path.cpu_seconds), inf, method.stepper.order)
 
@@ -214,7 +214,7 @@ class _MethodSearch:
     ) -> TrialOutcome[Trial]:
         """Run a method at a setting, and estimate its error if a reference trial exists."""
         try:
-            trial = self._integrate_motion(method, setting, time_limit)
+            trial = self._integrate_motion(method, setting, time_limit, is_timed=True)
         except TimeBudgetExceeded:
             return TrialOutcome(is_late=True)
         except StepSizeUnderflow as error:
