@@ -316,7 +316,7 @@ class ObstacleContact(BarrierContact):
         start_positions: obstacle vertices (o, 3) [m] at the step's start.
         current_positions: obstacle vertices (o, 3) [m] of the evaluation.
         end_positions: obstacle vertices (o, 3) [m] at the step's end.
-        step_times: start and end of the step [s].
+        step_times: start and end of the step [s], if an obstacle moves in it.
     """
 
     obstacle_positions_at: ObstacleMotion
@@ -362,20 +362,21 @@ class ObstacleContact(BarrierContact):
     def begin_step(self, start: StepStart) -> Self:
         """Return the energy of a step, with obstacles at their end positions."""
         begun, end = self.obstacle_positions_at(start.time), self.obstacle_positions_at(start.stage_time)
-        step = replace(
-            self,
-            start_positions=begun,
-            current_positions=end,
-            end_positions=end,
-            step_times=(start.time, start.stage_time),
-        )
-        if self.friction:
-            first = np.concatenate([start.positions, begun])
-            pressed = (
-                first if start.normal_force_positions is None else np.concatenate([start.normal_force_positions, end])
+        step = self
+        if not begun is end is self.current_positions:
+            step = replace(
+                self,
+                start_positions=begun,
+                current_positions=end,
+                end_positions=end,
+                step_times=(start.time, start.stage_time),
             )
-            step = replace(step, tangential_collisions=step._build_tangential_collisions(pressed, first, start))
-        return step
+        if not self.friction:
+            return step
+        first = np.concatenate([start.positions, begun])
+        pressed = first if start.normal_force_positions is None else np.concatenate([start.normal_force_positions, end])
+        tangential = step._build_tangential_collisions(pressed, first, start)
+        return step if tangential is step.tangential_collisions else replace(step, tangential_collisions=tangential)
 
     def append_obstacle_positions(self, p: Positions) -> Positions:
         """Return the positions of all vertices, those of the mesh (n, 3) first."""

@@ -100,6 +100,8 @@ def solve_with_friction(prepared: PreparedSolver, problem: StepProblem, stop: St
     rounds = _max_friction_iterations(problem.system)
     if not rounds or evaluates_friction(prepared):
         return FrictionSolve(problem, solution, (solution.num_iterations,), None)
+    if _has_no_normal_forces(problem, solution.positions):
+        return FrictionSolve(problem, solution, (solution.num_iterations,), FrictionConvergence(1, 0.0))
     counts, guess = [solution.num_iterations], problem.initial_guess
     earlier = deque[_Round](maxlen=MAX_CYCLE_PERIOD)
     while True:
@@ -157,6 +159,14 @@ def _is_cycle_at_largest(earlier: deque[_Round], x: Positions, acting: float) ->
         if _largest_component(x - earlier[-period].positions) <= CYCLE_RTOL * moved:
             return acting >= (1.0 - CYCLE_RTOL) * max(one.acting for one in list(earlier)[-period:])
     return False
+
+
+def _has_no_normal_forces(problem: StepProblem, x: Positions) -> bool:
+    """Return whether friction vanishes with the normal forces of the step, and with those at x (n, 3).
+
+    Energies of contact are not negative, so their forces vanish where they are zero.
+    """
+    return all(e.friction_gradient(x) is None and e.value(x) == 0.0 for e in problem.energies if has_friction(e))
 
 
 def _relative_friction_change(problem: StepProblem, following: StepProblem, x: Positions) -> tuple[float, float]:

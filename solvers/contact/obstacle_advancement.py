@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 from springbench.solvers.model.barrier_energy import BarrierEnergy, is_barrier_energy, max_step_size
@@ -50,13 +51,19 @@ def intersection_free_guess(problem: StepProblem) -> StepProblem:
     def is_free(q: Positions) -> bool:
         return all(energy.collision_free_step_size_moving(p, q - p, 0.0) == 1.0 for energy in energies)
 
-    start, rest = p, np.zeros_like(p)
-    if not is_free(p) and all(energy.at_fraction(0.0).collision_free_step_size(p, rest) == 1.0 for energy in energies):
-        start = _find_clear_positions(problem, energies)
-    current = problem.current_positions if is_free(problem.current_positions) else start
+    @cache
+    def find_start() -> Positions:
+        rest = np.zeros_like(p)
+        if is_free(p) or not all(
+            energy.at_fraction(0.0).collision_free_step_size(p, rest) == 1.0 for energy in energies
+        ):
+            return p
+        return _find_clear_positions(problem, energies)
+
+    current = problem.current_positions if is_free(problem.current_positions) else find_start()
     guess = current
     if problem.initial_guess is not problem.current_positions:
-        guess = problem.initial_guess if is_free(problem.initial_guess) else start
+        guess = problem.initial_guess if is_free(problem.initial_guess) else find_start()
     if current is problem.current_positions and guess is problem.initial_guess:
         return problem
     return replace(problem, current_positions=current, initial_guess=guess)
