@@ -323,7 +323,8 @@ def query(
 ) -> None:
     """Run an SQL query over the rows of all sweeps."""
     from springbench.harness.report.machine_footer import COMPARISON_NOTE
-    from springbench.harness.report.sql_query import MANY_FILES, MAX_CSV_ROWS, MAX_SHOWN_ROWS, run_query
+    from springbench.harness.report.sql_query import MAX_CSV_ROWS, MAX_SHOWN_ROWS, run_query
+    from springbench.harness.results.row_store import MANY_FILES
 
     show_activity("executing the query")
     console = get_output_console()  # imports Rich while the process of the query starts

@@ -24,8 +24,8 @@ from springbench.solvers.platform_calls import (
 
 DONE_ELSEWHERE, CLAIMED_ELSEWHERE = "was done by another command", "is left to another command"
 
-_LOCK_TIMEOUT = 5.0
-"""Seconds that the first or the last process may take to clean up."""
+_LOCK_TIMEOUT = 60.0
+"""Seconds that the first or the last process may take to clean up, or to pack rows."""
 
 _POLL_INTERVAL = 0.2
 """Seconds between two polls of other processes' results."""

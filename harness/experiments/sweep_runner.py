@@ -28,7 +28,7 @@ from springbench.harness.experiments.experiment_units import (
 from springbench.harness.experiments.kernel_precompilation import compile_missing_kernels
 from springbench.harness.experiments.run_unit import RunUnit
 from springbench.harness.experiments.sweep_plan import REQUIRED_COLUMNS, RunFiles, find_stale_run_ids, plan_runs
-from springbench.harness.results import parquet_rows
+from springbench.harness.results import parquet_rows, row_store
 from springbench.harness.scenes.scene_builder import build_scene
 from springbench.harness.simulation.direct_solve_remarks import describe_inaccurate_solvers, solves_with_system_matrix
 from springbench.solvers.plugins.plugin_discovery import PluginName, load_target
@@ -102,6 +102,8 @@ def run_sweep(
     background_call: Callable[[], object] = int,
 ) -> SweepResults:
     """Execute the missing runs of a sweep, draw its pictures and return its results.
+
+    Rows of many runs are packed into one file (`springbench.harness.experiments.archive.compaction`).
 
     Args:
         name: name of the sweep.
@@ -191,19 +193,33 @@ def run_sweep(
         )
         if drawing is None:
             draw(print_message)
-            return SweepResults(table, stale_ids)
-        try:
-            drawing.run_task(
-                draw,
-                lambda message: print_message(message) if is_step_event(message) else None,
-                TaskLimits(),
-                background_call,
-            )
-        except TaskFailure as lost:
-            raise RunFailed(
-                f"the process that draws {lost}; measured results remain, and the same command draws them"
-            ) from None
+        else:
+            _draw_in_process(drawing, draw, print_message, background_call)
+    if row_store.has_many_files(folder / "rows"):
+        from springbench.harness.experiments.archive.compaction import compact_sweep
+
+        compact_sweep(folder, print_message)
     return SweepResults(table, stale_ids)
+
+
+def _draw_in_process(
+    drawing: IsolatedWorker,
+    draw: Callable[[Callable[[str], None]], None],
+    print_message: Callable[[str], None],
+    background_call: Callable[[], object],
+) -> None:
+    """Draw the pictures in another process; raise RunFailed if it is lost."""
+    try:
+        drawing.run_task(
+            draw,
+            lambda message: print_message(message) if is_step_event(message) else None,
+            TaskLimits(),
+            background_call,
+        )
+    except TaskFailure as lost:
+        raise RunFailed(
+            f"the process that draws {lost}; measured results remain, and the same command draws them"
+        ) from None
 
 
 def describe_inaccurate_runs(runs: Iterable[RunSpec]) -> Iterator[str]:

@@ -24,9 +24,6 @@ EXECUTE_QUERY = "springbench.harness.report.sql_execution:execute_query"
 
 _SECONDS_PER_FILE = 1e-3
 """Additional processor time per file [s]; a file takes a third of it."""
-
-MANY_FILES = 500
-"""Number of files from which on opening them takes most of a query's time."""
 MAX_SHOWN_ROWS, MAX_CSV_ROWS = 1_000, 1_000_000
 """Maximum number of rows of a result in a table and in CSV; the rest is omitted."""
 QUERY_MEMORY_BYTES = 2**30

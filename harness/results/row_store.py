@@ -26,6 +26,9 @@ if TYPE_CHECKING:
 TABLE_FOLDERS = ("rows", "accuracy", "ablation")
 """Names of the folders of rows in the results of a sweep, and stems of packed files."""
 
+MANY_FILES = 500
+"""Number of files from which on opening them takes most of a query's time."""
+
 FILE_COLUMN = "file"
 """Column of a packed file that names the unit."""
 
@@ -63,6 +66,11 @@ def list_unit_files(folder: Path) -> set[str]:
             return {e.name[:-8] for e in entries if e.name.endswith(".parquet") and not e.name.startswith(".")}
     except (FileNotFoundError, NotADirectoryError):
         return set()
+
+
+def has_many_files(folder: Path) -> bool:
+    """Return whether MANY_FILES units or more have a file of their own."""
+    return len(list_unit_files(folder)) >= MANY_FILES
 
 
 def list_packed_units(folder: Path) -> frozenset[str]:

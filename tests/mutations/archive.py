@@ -19,8 +19,7 @@ ARCHIVE = (
     Mutation(
         "packed-without-comparing",
         "harness/experiments/archive/compaction.py",
-        "if not parquet_rows.is_bitwise_equal(\n                file.read_row_group(group), "
-        "parquet_rows.read_rows_by_file(batch, schema, with_unit_names=True)\n            ):",
+        "if not parquet_rows.is_bitwise_equal(file.read_row_group(group), _read_by_file(batch, schema)):",
         "if not file.num_row_groups:",
         (f"{_ROW_STORE}::test_nothing_is_removed_where_the_packed_rows_differ_from_the_originals",),
     ),

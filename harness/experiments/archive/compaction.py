@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator, Sequence
+from math import inf
 from pathlib import Path
 from time import time
 from typing import BinaryIO
@@ -20,11 +21,11 @@ from typing import BinaryIO
 import pyarrow as pa
 import pyarrow.parquet as pq
 from springbench.harness.atomic_files import atomic_write
-from springbench.harness.errors import InputError, InputMistake
+from springbench.harness.errors import InputError, InputMistake, SpringbenchError
 from springbench.harness.execution import folder_locks
 from springbench.harness.results import parquet_rows, row_store, run_schema
 
-_BATCH_SIZE = 2_000
+_BATCH_SIZE = 100
 """Number of units that are in memory at a time."""
 _SECONDS_PER_DAY = 86_400.0
 _EMPTY_SCHEMA = pa.schema([])
@@ -51,6 +52,23 @@ def compact_results(results: Path, print_message: Callable[[str], None], *, min_
         with folder_locks.lock_folder_exclusive(folder.parent):
             count += _compact_folder(folder, time() - _SECONDS_PER_DAY * min_age_days, print_message)
     return count
+
+
+def compact_sweep(folder: Path, print_message: Callable[[str], None]) -> None:
+    """Pack the rows of a sweep that has ended.
+
+    The files stay if another process uses the folder, which packs them when it ends, or if they cannot be packed.
+
+    Args:
+        folder: folder of the sweep.
+        print_message: called with a remark.
+    """
+    try:
+        with folder_locks.lock_folder_exclusive(folder):
+            print_message("packing the rows of all runs into one file, which is faster to read")
+            _compact_folder(folder / "rows", inf, print_message)
+    except (SpringbenchError, OSError) as error:
+        print_message(f"rows stay in one file per run: {error}")
 
 
 def _compact_folder(folder: Path, max_modified_time: float, print_message: Callable[[str], None]) -> int:
@@ -134,11 +152,24 @@ def _check_compacted_rows(written: BinaryIO, units: Sequence[Path], schema: pa.S
     """
     with pq.ParquetFile(written) as file:
         for group, batch in enumerate(_iterate_batches(units)):
-            if not parquet_rows.is_bitwise_equal(
-                file.read_row_group(group), parquet_rows.read_rows_by_file(batch, schema, with_unit_names=True)
-            ):
+            if not parquet_rows.is_bitwise_equal(file.read_row_group(group), _read_by_file(batch, schema)):
                 why = f"the packed rows differ from those in the {len(batch)} files from here on; nothing was removed"
                 raise InputError(InputMistake(why, batch[0]))
+
+
+def _read_by_file(units: Sequence[Path], schema: pa.Schema) -> pa.Table:
+    """Read the rows of units by pyarrow, file by file, with their names.
+
+    Limits of size are not checked again, which would take most of the time of packing.
+    """
+    packed = parquet_rows.read_packed_rows(units)
+    tables = [schema.append(_FILE_FIELD).empty_table()]
+    for unit in units:
+        if (table := packed.get(unit)) is None:
+            with unit.open("rb") as content, pq.ParquetFile(content) as file:
+                table = file.read(use_threads=False)
+        tables.append(table.append_column(_FILE_FIELD, pa.repeat(unit.stem, len(table))))
+    return pa.concat_tables(tables, promote_options="default")
 
 
 def _sync_folder(folder: Path) -> None:
