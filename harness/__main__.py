@@ -9,12 +9,13 @@ import os
 import sys
 from io import TextIOWrapper
 
-from springbench.harness.execution import interrupts
+from springbench.harness.execution import garbage_collection, interrupts
 
 
 def main() -> None:
     """Run the command that the arguments name."""
     interrupts.install_handler()
+    garbage_collection.postpone_collections()
     try:
         from springbench.harness.console import show_activity
 
@@ -34,6 +35,7 @@ def main() -> None:
         raise
     finally:
         interrupts.ignore_interrupts()
+        garbage_collection.skip_final_collections()
 
 
 def _prepare_environment() -> None:

@@ -209,16 +209,17 @@ def _report_sweep(sweep: SweepPlan, swept: SweepResults, config: Path, results: 
     from springbench.harness.report.report_plugins import run_reports
     from springbench.harness.report.site import refresh_results_page
     from springbench.harness.report.sweep_summary import build_closing_lines
-    from springbench.harness.report.timing_table import build_summary_table
+    from springbench.harness.report.timing_table import build_summary_table, read_run_times
 
     table = swept.table
-    get_output_console().print(build_summary_table(table, swept.stale_ids))
+    timed_runs = read_run_times(table)
+    get_output_console().print(build_summary_table(timed_runs, table, swept.stale_ids))
     print_message(f"rows, recordings and pictures are in {folder}")
     for path in run_reports(sweep.reports, table, folder, sweep.options.time_limit):
         print_message(f"reported in {path}")
     refresh_results_page(results, folder, print_message, is_quiet=True)
     failed = list_failed_runs(table)
-    for line in (*failed, *build_closing_lines(table, config, results, folder)):
+    for line in (*failed, *build_closing_lines(timed_runs, config, results, folder)):
         print_message(line)
     return failed
 

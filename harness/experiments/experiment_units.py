@@ -15,6 +15,7 @@ from typing import Protocol, TypeVar, runtime_checkable
 
 from springbench.harness.execution import machine_info
 from springbench.harness.execution.folder_locks import CLAIMED_ELSEWHERE, UnitClaims
+from springbench.harness.execution.garbage_collection import resume_collections
 from springbench.harness.execution.isolated_worker import ProgressCallback, TaskFailure, TaskLimits
 from springbench.harness.execution.progress_display import ProgressDisplay, RunCost, RunProgress, ThrottledMessages
 from springbench.harness.execution.progress_events import report_compilation
@@ -210,6 +211,7 @@ def execute_timed(unit: ExperimentUnit, tick: ProgressCallback) -> str:
     Returns:
         The outcome as text.
     """
+    resume_collections()
     with report_compilation(tick), nullcontext() if isinstance(unit, SelfTimedUnit) else lock_timing_exclusive(tick):
         return unit.execute_unit(tick)
 

@@ -9,12 +9,11 @@ from glob import escape
 from pathlib import Path
 from textwrap import wrap
 
-import pyarrow as pa
 from springbench.harness.config.shipped_configs import get_config_name
 from springbench.harness.report import equal_accuracy
 from springbench.harness.report.energy_losses import NOTABLE_SHARE, describe_losses, format_energy_share
 from springbench.harness.report.equal_accuracy import compare_runs
-from springbench.harness.report.timing_table import TABLE_WIDTH, RunTimes, label_runs, read_run_times
+from springbench.harness.report.timing_table import TABLE_WIDTH, RunTimes, label_runs
 
 SOLVED_RESIDUAL = 1e-2
 """Share of a step's initial residual above which the final residual of a method that does not minimise is reported."""
@@ -30,21 +29,21 @@ MAX_DISSIPATION_SENTENCES = 3
 """Maximum number of sentences on dissipation."""
 
 
-def build_closing_lines(table: pa.Table, config: Path, results: Path, folder: Path) -> list[str]:
+def build_closing_lines(timed_runs: Sequence[RunTimes], config: Path, results: Path, folder: Path) -> list[str]:
     """Build the last lines of a sweep: findings, commands, and the page's address.
 
     No line is longer than TABLE_WIDTH, except for paths.
 
     Args:
-        table: rows of the sweep.
+        timed_runs: runs of the sweep.
         config: config that was run.
         results: folder of the results of all sweeps.
         folder: folder of this sweep's results.
     """
-    found, page = read_run_times(table), results / "index.html"
-    sentences = summarise_sweep(found)
+    page = results / "index.html"
+    sentences = summarise_sweep(timed_runs)
     lines = ["what was learned:", *(f"  {line}" for line in sentences)] if sentences else []
-    lines += ["what to do next:", *suggest_commands(found, config, results, folder / "recordings")]
+    lines += ["what to do next:", *suggest_commands(timed_runs, config, results, folder / "recordings")]
     return [*lines, f"everything on one page: {page.resolve().as_uri()}"] if page.is_file() else lines
 
 

@@ -224,17 +224,17 @@ SHARED_TIMING_NOTE = (
 )
 
 
-def build_summary_table(table: pa.Table, stale_ids: Collection[str] = ()) -> Table:
+def build_summary_table(timed_runs: Sequence[RunTimes], table: pa.Table, stale_ids: Collection[str] = ()) -> Table:
     """Build a table with one line per run.
 
     It has the identification, the status and the times [ms], with marks on doubtful values.
 
     Args:
-        table: rows of the sweep.
+        timed_runs: runs of the sweep.
+        table: its rows.
         stale_ids: ids of runs that were executed by other code than the current version; they are marked.
     """
-    found = read_run_times(table)
-    names, scenes = label_runs(found), {run.scene for run in found}
+    names, scenes = label_runs(timed_runs), {run.scene for run in timed_runs}
     what, above = f"{scenes.pop()}: " if len(scenes) == 1 else "", list[str]()
     out = Table(
         title=f"{escape(what)}times in milliseconds, medians over the rounds and over the steps",
@@ -248,10 +248,10 @@ def build_summary_table(table: pa.Table, stale_ids: Collection[str] = ()) -> Tab
     out.add_column(
         "\nsolver", overflow="fold", min_width=min(_MIN_NAME_WIDTH, max(map(len, names.values()), default=0))
     )
-    has_dissipation = any(run.dissipation_shares for run in found)
+    has_dissipation = any(run.dissipation_shares for run in timed_runs)
     for name in (*_NUMBER_HEADINGS, *((_DISSIPATION_HEADING,) if has_dissipation else ())):
         out.add_column(name, justify="left" if name == "\nstopped" else "right", no_wrap=True)
-    for run in found:
+    for run in timed_runs:
         if not what and (not above or above[-1] != run.scene):
             out.add_section()
             out.add_row("", f"[bold]{escape(run.scene)}[/]")
@@ -277,15 +277,15 @@ def build_summary_table(table: pa.Table, stale_ids: Collection[str] = ()) -> Tab
         )
     marks = {
         DISSIPATION_NOTE: has_dissipation,
-        PREEMPTED_NOTE: any(run.preempted for run in found),
-        INCONSISTENT_NOTE: any(_inconsistency_mark(run, run.local) for run in found),
+        PREEMPTED_NOTE: any(run.preempted for run in timed_runs),
+        INCONSISTENT_NOTE: any(_inconsistency_mark(run, run.local) for run in timed_runs),
     }
     shared = [
         n
         for how, n in zip(*(table[c].to_pylist() for c in ("timing", "num_concurrent_runs")), strict=True)
         if how == "shared"
     ]
-    marks[STALE_MARK_NOTE] = any(run.run_id in stale_ids for run in found)
+    marks[STALE_MARK_NOTE] = any(run.run_id in stale_ids for run in timed_runs)
     marks[SHARED_TIMING_NOTE.format(max(shared, default=0))] = bool(shared)
     out.caption = Text(
         "\n".join(

@@ -35,7 +35,8 @@ class ConfigModel(BaseModel):
         ...
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=False, allow_inf_nan=False)
+    # A deferred model is built when it is used first: most are bases or parts of others, and are never used themselves.
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=False, allow_inf_nan=False, defer_build=True)
 
     @classmethod
     def __get_pydantic_json_schema__(

@@ -198,7 +198,8 @@ def find_class_sources(made: type) -> frozenset[Path]:
     own = {getattr(sys.modules.get(made.__module__), "__file__", None)}
     for base in made.__mro__:
         # A module that was loaded manually may be identifiable by its functions only.
-        codes = (getattr(value, "__code__", None) for value in vars(base).values())
+        values = list(vars(base).values())  # a model of pydantic may be completed by the access to its attributes
+        codes = (getattr(value, "__code__", None) for value in values)
         files = {code.co_filename for code in codes if code}
         files.add(getattr(sys.modules.get(base.__module__), "__file__", None))
         own |= {file for file in files if file and not _is_library_file(file)}

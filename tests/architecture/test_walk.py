@@ -184,7 +184,7 @@ def test_a_run_enters_few_modules_and_seldom_changes_them(walk: list[Call]):
         if "springbench.harness.report" not in call.by and "springbench.harness.report" not in call.of
     ]
     modules = {call.of for call in before}
-    assert len(modules) <= 104, "104 when this was counted last, the accuracy of direct solves among them"
+    assert len(modules) <= 105, "105 when this was counted last, the accuracy of direct solves among them"
     assert len(before) <= 1680, "1,668 when this was counted last, the accuracy of direct solves among them"
 
 

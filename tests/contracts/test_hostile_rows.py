@@ -56,7 +56,7 @@ def test_odd_rows_that_fit_are_shown(tmp_path: Path):
 @pytest.mark.parametrize("name", ODD_COLUMNS)
 def test_odd_rows_are_reported_at_the_end_of_a_sweep(tmp_path: Path, name: str):
     table = read_rows(write_cases(tmp_path / "cases", {name: ODD_COLUMNS[name]}))
-    Console(file=StringIO()).print(build_summary_table(table))
+    Console(file=StringIO()).print(build_summary_table(read_run_times(table), table))
     summarise_sweep(read_run_times(table))
     draw_timing_plot(table, tmp_path / "timing.png", name)
     write_medians(table, tmp_path)

@@ -23,7 +23,7 @@ from springbench.harness.report.plot_style import assign_solver_styles
 from springbench.harness.report.robustness import CORRECT, read_verified_runs
 from springbench.harness.report.site import update_page
 from springbench.harness.report.timing_plot import draw_timing_plot
-from springbench.harness.report.timing_table import build_summary_table
+from springbench.harness.report.timing_table import build_summary_table, read_run_times
 from springbench.harness.scenes.effects.effect_interface import EffectContribution, ObservedMotion, build_constant_force
 from springbench.harness.scenes.effects.effect_table import EFFECT_CLASSES
 from springbench.harness.scenes.mesh.mesh import Mesh
@@ -135,7 +135,7 @@ def test_a_sweep_and_its_reports_take_a_new_solver_and_effect(configs: Path):
     assert cells["mine"].outcome == cells["sparse"].outcome == CORRECT
     table = pa.Table.from_pylist(found, schema=RUN_SCHEMA)
     draw_timing_plot(table, configs / "timing.png", "Time")
-    assert "mine: Noether 1918" in str(build_summary_table(table).caption)
+    assert "mine: Noether 1918" in str(build_summary_table(read_run_times(table), table).caption)
 
 
 def test_the_accuracy_report_takes_a_new_solver_and_effect(configs: Path):

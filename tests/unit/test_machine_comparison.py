@@ -51,7 +51,7 @@ def print_table(table: Any) -> str:
 def test_a_sweeps_table_names_the_machine_of_each_run_and_what_it_can_do():
     table = table_of(two_machines())
     assert list(label_runs(read_run_times(table)).values()) == ["sparse, machine 000000", "dense, machine 111111"]
-    text = print_table(build_summary_table(table))
+    text = print_table(build_summary_table(read_run_times(table), table))
     assert "8 sparse, machine – – 1 1 – – 50 ok 1.0e-03 – – 000000" in text
     assert "machine 111111: a processor, 2 cores, by one thread 12 GB/s, 40 GFLOP/s, a fixed step 3.1 ms" in text
     assert COMPARISON_NOTE in text
@@ -67,7 +67,8 @@ def test_two_computers_of_one_kind_are_distinguished():
 
 def test_a_table_of_one_machine_names_it_once_and_in_no_row():
     one = [row | {"machine_id": "a" * 12} for row in two_machines()]
-    text = print_table(build_summary_table(table_of(one)))
+    table = table_of(one)
+    text = print_table(build_summary_table(read_run_times(table), table))
     assert len(re.findall("machine aaaaaa", text)) == 1
     assert COMPARISON_NOTE in text
 

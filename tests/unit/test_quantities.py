@@ -82,7 +82,7 @@ def test_every_place_states_the_same_numbers_of_a_run(tmp_path: Path):
     assert sparse.max_strain == pytest.approx(0.389)
 
     console = Console(width=200, record=True, file=StringIO())
-    console.print(build_summary_table(table))
+    console.print(build_summary_table(read_run_times(table), table))
     assert re.search(r"8 sparse +– +– +3\.5 +1 .* 38\.9 % +10 %", console.export_text())
 
     for run in (sparse, numba):

@@ -206,7 +206,8 @@ def test_solvers_have_marks_of_their_own_that_stay_the_same() -> None:
 
 def test_the_summary_has_a_line_for_each_run() -> None:
     console = Console(width=200, record=True, file=StringIO())
-    console.print(build_summary_table(rows(sizes=(10,), failed=[(10, "dense")])))
+    table = rows(sizes=(10,), failed=[(10, "dense")])
+    console.print(build_summary_table(read_run_times(table), table))
     lines = [" ".join(line.split()) for line in console.export_text().splitlines()]
     assert "cloth: times in milliseconds, medians over the rounds and over the steps" in lines
     assert "10 sparse 0.8 0.3 0.1 0.099 0.01 0.02 10 max-iter 1.0e-04 40 % 4 %" in lines
@@ -217,7 +218,7 @@ def test_the_summary_and_the_words_after_it_fit_a_hundred_columns() -> None:
     scenes, sizes = ("hanging-cloth", "a-scene-with-a-long-name"), (8, 32)
     table = rows(scenes=scenes, sizes=sizes, solvers=("local-global-sparse", "dense"), omegas=(1.0, 1.25))
     console = Console(width=240, record=True, file=StringIO())
-    console.print(build_summary_table(table))
+    console.print(build_summary_table(read_run_times(table), table))
     assert max(len(line.rstrip()) for line in console.export_text().splitlines()) <= 100
     assert max(map(len, summarise_sweep(read_run_times(table)))) <= 98, "two more go before each"
 
@@ -359,7 +360,8 @@ def test_a_sweep_ends_with_three_commands_and_one_link(tmp_path: Path) -> None:
     (results / "q" / "recordings").mkdir(parents=True)
     seen = results / "q" / "recordings" / "hanging-cloth-32-sparse-hanging-cloth 32 sparse 1.0.rrd"
     seen.touch()
-    lines = build_closing_lines(table, config, results, results / "q")
+    timed_runs = read_run_times(table)
+    lines = build_closing_lines(timed_runs, config, results, results / "q")
     commands = [shlex.split(line) for line in lines if line.startswith("  springbench")]
     scene = str(ROOT / "configs" / "scenes" / "hanging-cloth.yaml")
     assert commands == [
@@ -368,7 +370,7 @@ def test_a_sweep_ends_with_three_commands_and_one_link(tmp_path: Path) -> None:
         ["springbench", "report", str(results)],
     ]
     (results / "index.html").touch()
-    assert build_closing_lines(table, config, results, results / "q")[-1].endswith("/my%20results/index.html")
+    assert build_closing_lines(timed_runs, config, results, results / "q")[-1].endswith("/my%20results/index.html")
 
 
 def test_the_summary_marks_unreliable_times_and_states_why() -> None:
@@ -377,12 +379,14 @@ def test_the_summary_marks_unreliable_times_and_states_why() -> None:
         row["preempted"] = row["phase"] == "step" and row["frame"] == 2
         row["phases_consistent"] = False if row["phase"] in ("local", "global") else None
     console = Console(width=200, record=True, file=StringIO())
-    console.print(build_summary_table(pa.Table.from_pylist(given_rows, schema=RUN_SCHEMA)))
+    table = pa.Table.from_pylist(given_rows, schema=RUN_SCHEMA)
+    console.print(build_summary_table(read_run_times(table), table))
     text = " ".join(console.export_text().split())
     assert "10 sparse 0.8 0.3 0.1! 0.099 0.01~ 0.02~ 10" in text
     assert PREEMPTED_NOTE in text
     assert INCONSISTENT_NOTE in text
-    console.print(build_summary_table(rows(sizes=(10,), solvers=("sparse",))))
+    table = rows(sizes=(10,), solvers=("sparse",))
+    console.print(build_summary_table(read_run_times(table), table))
     text = " ".join(console.export_text().split())
     assert not {"!", "~"} & set(text.split("below")[-1]), "rows that say nothing of it have no marks"
 
