@@ -87,6 +87,9 @@ def run_timed_sweep(runs: list[RunSpec], folder: Path, workers: int | None) -> S
 
 def _run_in_child(answer: Any, runs: list[RunSpec], folder: Path, workers: int | None) -> None:
     began = monotonic()
+    from springbench.harness.execution.pandas_deferral import request_deferral
+
+    request_deferral()  # as a command does
     from springbench.harness.experiments import run_pipeline as runs_of
     from springbench.harness.experiments.sweep_runner import ExecutionOptions, run_sweep
 

@@ -1,7 +1,7 @@
 """Instrumentation pass of a run: repeats the steps and computes the columns of the solution.
 
-The convergence of a solve is traced independently of the solver. A second thread processes each step while the solver
-computes the next one, at most one step behind.
+The convergence of a solve is traced independently of the solver. Where a run is recorded or its mesh is large, a second
+thread processes each step while the solver computes the next one, at most one step behind.
 """
 
 from __future__ import annotations
@@ -118,6 +118,17 @@ class RunObservers(NamedTuple):
     verify_step: Callable[[SimulationStep], dict[str, Any]] | None = None
 
 
+_MIN_VERTICES_OF_THREAD = 3_000
+"""Number of vertices from which on a second thread saves more time than the exchange of a step with it takes."""
+
+
+def _call_at_once(function: Callable[..., None], *arguments: Any) -> Future[None]:
+    """Call a function in this thread, with the result of an executor's `submit`."""
+    done = Future[None]()
+    done.set_result(function(*arguments))
+    return done
+
+
 def observe_run(
     scene: Scene,
     prepared: PreparedSolver,
@@ -158,10 +169,12 @@ def observe_run(
             drawn = terms, residual, step.num_iterations, collect_forces(step), columns["num_intersections"]
             recorder.record_frame(RecordedFrame(step.index, scene.compute_time(step.index), step.positions, *drawn))
 
-    with ThreadPoolExecutor(1) as executor, measure_phases(thread_time):
+    is_small = recorder is None and len(scene.mesh.rest_positions) < _MIN_VERTICES_OF_THREAD
+    with ThreadPoolExecutor(1) as executor, measure_phases(thread_time):  # whose thread starts at the first call
+        submit_call = _call_at_once if is_small else executor.submit
         observed: Future[None] | None = None
         if recorder:
-            observed = executor.submit(
+            observed = submit_call(
                 recorder.record_frame,
                 RecordedFrame(0, 0.0, build_initial_state(scene).motion.positions, {}, float("nan"), 0),
             )
@@ -173,9 +186,7 @@ def observe_run(
             if balance.is_above(BLOW_UP_FACTOR):
                 raise StepError(step.index) from DivergenceError(f"from frame {step.index} on the motion has {balance}")
             dissipation = budget.add_step(step)
-            observed = executor.submit(
-                observe_step, step, compute_returned_residual(prepared, step), balance, dissipation
-            )
+            observed = submit_call(observe_step, step, compute_returned_residual(prepared, step), balance, dissipation)
             if recorder and step.index in convergence_frames:
                 norm = EnergyNorm(step.problem.system)
                 # A further round of friction starts where the previous one ended; only the first one is drawn.

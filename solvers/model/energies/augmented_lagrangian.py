@@ -108,6 +108,8 @@ def compute_penalty_stiffness(system: System, constraints: LengthConstraints) ->
     Returns:
         Stiffnesses k (m,) [N/m].
     """
+    if not len(constraints.edges):
+        return np.empty(0)
     q = system.inertia_diagonal.copy()
     for share in stiffness_shares(
         system, [energy for energy in system.energies if isinstance(energy, ProjectiveEnergy)]
