@@ -8,7 +8,7 @@ from __future__ import annotations
 import gc
 
 _USUAL_THRESHOLD = gc.get_threshold()
-_RARE_THRESHOLD = 100_000
+_RARE_THRESHOLD = 300_000
 """Number of new objects that start a collection."""
 
 
