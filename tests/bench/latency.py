@@ -109,7 +109,7 @@ LATENCY_ROWS = {
         0.7,
         _SWEEP,
         (_SWEEP,),
-        limit="three quarters imports: NumPy, PyArrow, Pydantic with Typer, DuckDB and Rich; the rest reads rows and prints",
+        limit="three quarters imports: NumPy, PyArrow, Pydantic, Typer, DuckDB, Rich; the rest reads rows",
     ),
     "again-numba": LatencyRow("--rerun of a small run, numba", 2.5, _AGAIN_NUMBA, (_AGAIN_NUMBA,), limit=_OF_A_RERUN),
     "again-hybrid": LatencyRow(
@@ -123,7 +123,7 @@ LATENCY_ROWS = {
         _QUERY,
         (_SWEEP,),
         prepare=_copy_runs,
-        limit="two thirds DuckDB, which opens 3,000 files one after the other, each in 0.5 ms: 4 us for each of 123 columns",
+        limit="two thirds DuckDB, which opens 3,000 files one by one: 4 us for each of 123 columns",
     ),
     "query-packed": LatencyRow(
         f"the same after their sweep has ended, which packs them ({NUM_STORED_RUNS:,} runs in one file)",
@@ -192,7 +192,7 @@ LATENCY_ROWS = {
         (*_IN_PROCESS, "overhead-share"),
         value_key="share",
         is_long=True,
-        limit="one half the untimed second pass and the rows of each run, the other imports and first calls of each process",
+        limit="half the untimed second pass and the rows of each run, half imports and first calls",
     ),
     "first-run-numba": LatencyRow(
         "first run, numba",

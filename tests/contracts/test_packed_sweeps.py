@@ -16,7 +16,7 @@ from springbench.harness.results import parquet_rows, row_store
 from tests.plugin_solvers import SCENE_SOURCE
 from tests.progress_displays import SilentDisplay
 
-QUERY = "SELECT run_id, count(*), any_value(started_at) FROM rows GROUP BY run_id ORDER BY run_id"
+QUERY = "SELECT run_id, count(*), sum(seconds) FROM rows GROUP BY run_id ORDER BY run_id"
 
 
 @pytest.fixture(autouse=True)
