@@ -17,7 +17,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 FloatArray = NDArray[np.float64]
 IndexArray = NDArray[np.int64]
@@ -34,6 +33,9 @@ _SMALLEST_VOLUME = 1e-250
 
 _PAIRS_PER_CHUNK = 200_000
 """Approximate number of pairs tested per chunk, for 64 triangles near each edge."""
+
+_MAX_EXHAUSTIVE_PAIRS = 500_000
+"""Number of pairs up to which all boxes are compared: that takes 10 ms at most, and the import of a tree 0.2 s."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,21 +96,39 @@ def _overlapping_box_pairs(
 ) -> Iterator[tuple[IndexArray, IndexArray]]:
     """Yield chunks of edge-triangle pairs, by index, with overlapping boxes and no common vertex."""
     a, b = p[edges], p[triangles]
+    list_near = _list_near_boxes if len(edges) * len(triangles) <= _MAX_EXHAUSTIVE_PAIRS else _list_near_spheres
+    low, high, below, above = a.min(axis=1), a.max(axis=1), b.min(axis=1), b.max(axis=1)
+    for e, t in list_near(a, b):
+        over = ((low[e] <= above[t]) & (below[t] <= high[e])).all(axis=1)
+        over &= (edges[e][:, :, None] != triangles[t][:, None, :]).all(axis=(1, 2))
+        yield e[over], t[over]
+
+
+def _list_near_boxes(a: FloatArray, b: FloatArray) -> Iterator[tuple[IndexArray, IndexArray]]:
+    """Yield the edges a (m, 2, 3) and triangles b (f, 3, 3) with overlapping boxes, by index."""
+    near = np.ones((len(a), len(b)), bool)
+    for x, y in zip(a.T, b.T, strict=True):  # coordinates
+        near &= np.less_equal.outer(x.min(axis=0), y.max(axis=0))
+        near &= np.greater_equal.outer(x.max(axis=0), y.min(axis=0))
+    e, t = np.nonzero(near)
+    yield e, t
+
+
+def _list_near_spheres(a: FloatArray, b: FloatArray) -> Iterator[tuple[IndexArray, IndexArray]]:
+    """Yield edges a (m, 2, 3) and triangles b (f, 3, 3) with overlapping bounding spheres, by index, in chunks."""
+    from scipy.spatial import cKDTree  # slow to import
+
     middle, centre = a.mean(axis=1), b.mean(axis=1)
     half = np.linalg.norm(a - middle[:, None], axis=2).max(axis=1)
     wide = np.linalg.norm(b - centre[:, None], axis=2).max(axis=1)
     tree: Any = cKDTree(centre)
-    reach = (half + float(wide.max())) * (1.0 + 1e-9) + _ROUNDOFF * float(np.abs(p).max())
-    low, high, below, above = a.min(axis=1), a.max(axis=1), b.min(axis=1), b.max(axis=1)
+    reach = (half + float(wide.max())) * (1.0 + 1e-9) + _ROUNDOFF * max(float(np.abs(a).max()), float(np.abs(b).max()))
     step = max(1, _PAIRS_PER_CHUNK // 64)
-    for first in range(0, len(edges), step):
+    for first in range(0, len(a), step):
         part = slice(first, first + step)
         lists: list[list[int]] = tree.query_ball_point(middle[part], reach[part]).tolist()
         e = np.repeat(np.arange(first, first + len(lists)), [len(x) for x in lists])
-        t = np.array([one for found in lists for one in found], np.int64)
-        over = ((low[e] <= above[t]) & (below[t] <= high[e])).all(axis=1)
-        over &= (edges[e][:, :, None] != triangles[t][:, None, :]).all(axis=(1, 2))
-        yield e[over], t[over]
+        yield e, np.array([one for found in lists for one in found], np.int64)
 
 
 def _has_separating_axis(p: FloatArray, edges: IndexArray, triangles: IndexArray) -> NDArray[np.bool_]:
