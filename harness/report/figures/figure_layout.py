@@ -351,7 +351,7 @@ def _adjust_final_labels(axes: Sequence[Axes], panels: Sequence[FigurePanel], op
             settle = getattr(text, "settle", None)
             if settle is not None:
                 settle()
-    figure.set_layout_engine("none")
+    figure.set_layout_engine(None)
 
 
 def visible_texts(figure: Figure) -> list[Text]:
