@@ -196,7 +196,7 @@ class _WorkerProcess:
     """One worker process and its supervisor, as seen from the command."""
 
     def __init__(self, initialiser: Callable[[], object], *, fork: bool) -> None:
-        fork = fork and sys.platform == "linux" and not FORK_BLOCKERS and not _has_numba_threads()
+        fork = fork and can_fork()
         context: Any = get_context("fork" if fork else "spawn")
         self._calls, calls = context.Pipe()
         (self._ticks, ticks), (self._output, output), (self._dump, dump) = (
@@ -395,6 +395,11 @@ def _format_location(dump: bytes) -> str:
     """Format the location of a worker from its dump: `at file:line in function, `."""
     found = parse_fault_location(dump.decode(errors="replace"))
     return found and f"at {found}, "
+
+
+def can_fork() -> bool:
+    """Return whether all that was started in this process survives a fork."""
+    return sys.platform == "linux" and not FORK_BLOCKERS and not _has_numba_threads()
 
 
 def _has_numba_threads() -> bool:

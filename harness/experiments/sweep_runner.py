@@ -14,6 +14,7 @@ import pyarrow as pa
 from springbench.harness.config.sweep_config import RunSpec
 from springbench.harness.errors import InputError, InputMistake, RunFailed
 from springbench.harness.execution import folder_locks, machine_info
+from springbench.harness.execution.early_worker import take_early_worker
 from springbench.harness.execution.folder_locks import UnitClaims
 from springbench.harness.execution.isolated_worker import IsolatedWorker, TaskFailure, TaskLimits
 from springbench.harness.execution.progress_display import ProgressDisplay
@@ -28,6 +29,7 @@ from springbench.harness.experiments.experiment_units import (
 from springbench.harness.experiments.kernel_precompilation import compile_missing_kernels
 from springbench.harness.experiments.run_unit import RunUnit
 from springbench.harness.experiments.sweep_plan import REQUIRED_COLUMNS, RunFiles, find_stale_run_ids, plan_runs
+from springbench.harness.report.drawing_preload import preload_drawing
 from springbench.harness.results import parquet_rows, row_store
 from springbench.harness.scenes.scene_builder import build_scene
 from springbench.harness.simulation.direct_solve_remarks import describe_inaccurate_solvers, solves_with_system_matrix
@@ -154,9 +156,8 @@ def run_sweep(
         drawing: IsolatedWorker | None = None
         here = isolated and not away
         if here and len(runs) <= _MAX_RUNS_TO_PRELOAD and any(p.run.record and p.run.pictures for p in todo):
-            drawing = IsolatedWorker(_preload_drawing)
+            drawing = take_early_worker(preload_drawing)
             locks.callback(drawing.stop_worker)
-            drawing.start_worker()
         if todo and not away:
             import_module(
                 "springbench.harness.experiments.run_pipeline"
@@ -243,16 +244,6 @@ def describe_inaccurate_runs(runs: Iterable[RunSpec]) -> Iterator[str]:
             scene = build_scene(least.scene, least.size, least.integrator, log_warnings=False)
             if remark := describe_inaccurate_solvers(scene, dict.fromkeys(run.solver.name for run in some)):
                 yield f"{name}: {remark}"
-
-
-def _preload_drawing() -> None:
-    """In the drawing process of a small sweep: load the drawing code.
-
-    This takes 1 to 2 s, during the runs.
-    """
-    from springbench.harness.report.sweep_pictures import preload_drawing
-
-    preload_drawing()
 
 
 def list_failed_runs(table: pa.Table) -> list[str]:

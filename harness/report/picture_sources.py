@@ -12,8 +12,10 @@ import struct
 from collections.abc import Collection
 from contextlib import suppress
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import pyarrow as pa
+if TYPE_CHECKING:
+    import pyarrow as pa
 
 SOURCES_KEY = "Source"
 """Keyword of the PNG text that contains the digest."""

@@ -83,29 +83,6 @@ def draw_sweep_pictures(
     _draw_group_comparisons(groups, print_message, pictures=not missing)
 
 
-def preload_drawing() -> None:
-    """Load the drawing modules in this process, in parts.
-
-    No part is loaded while a timing runs.
-    """
-    from springbench.harness.report import opengl_probe
-
-    with lock_timing_shared(_ignore_progress):
-        opengl_probe.start_opengl_probe()
-        import_module("springbench.harness.report.timing_plot")  # with Matplotlib
-        problem = opengl_probe.find_opengl_problem()
-    if problem is not None:
-        return
-    for name in (
-        "springbench.harness.recording.recording_reader",
-        "pyvista",
-        "pyvista.plotting",
-        "springbench.harness.report.run_picture",
-    ):
-        with lock_timing_shared(_ignore_progress):
-            import_module(name)
-
-
 def _load_drawing() -> str | None:
     """Load the drawing modules for forked processes; return why drawing is impossible, or None."""
     from springbench.harness.report import opengl_probe

@@ -168,9 +168,10 @@ def test_a_worker_stays_from_run_to_run(tmp_path: Path, monkeypatch: pytest.Monk
 def test_a_lost_drawing_process_fails_the_command_and_preserves_the_measurements(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
+    from springbench.harness.experiments import sweep_runner
     from springbench.harness.report import sweep_pictures
 
-    monkeypatch.setattr(sweep_pictures, "preload_drawing", int)
+    monkeypatch.setattr(sweep_runner, "preload_drawing", int)
     monkeypatch.setattr(
         sweep_pictures, "draw_sweep_pictures", leave
     )  # where it draws: that process is a fork of this one

@@ -23,6 +23,7 @@ from springbench.harness.config.sweep_config import REPORT_TABLE
 from springbench.harness.report.change_detection import MIN_RESULTS
 from springbench.harness.report.charts.figure_panels import AxisScale, CurvePlot, CurveSeries
 from springbench.harness.report.figures import figure_kinds
+from springbench.harness.report.figures.figure_drawing import find_layout_faults
 from springbench.harness.report.figures.figure_files import write_figure
 from springbench.harness.report.figures.figure_layout import (
     MILLIMETRES_PER_INCH,
@@ -30,7 +31,6 @@ from springbench.harness.report.figures.figure_layout import (
     sort_by_end_value,
     visible_texts,
 )
-from springbench.harness.report.figures.figure_maker import find_layout_faults
 from springbench.harness.report.figures.figure_options import MIN_FONT_SIZE, FigureOptions
 from springbench.harness.report.figures.panel_drawing import marker_style
 from springbench.harness.report.plot_style import SeriesStyle

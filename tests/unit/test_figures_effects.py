@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 from springbench.harness.experiments.ablation.ablation_schema import ABLATION_SCHEMA
 from springbench.harness.report.ablation_summary import read_ablation
+from springbench.harness.report.figures.figure_drawing import find_layout_faults
 from springbench.harness.report.figures.figure_layout import MILLIMETRES_PER_INCH, visible_texts
-from springbench.harness.report.figures.figure_maker import find_layout_faults
 from springbench.harness.report.figures.figure_options import FigureOptions
 from springbench.solvers.registry import SOLVERS
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from springbench.harness.report import opengl_probe
-from springbench.harness.report.figures.figure_maker import find_layout_faults
+from springbench.harness.report.figures.figure_drawing import find_layout_faults
 from springbench.harness.results import parquet_rows as base_rows
 
 from tests import synthetic_results as made

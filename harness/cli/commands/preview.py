@@ -4,16 +4,20 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 from springbench.harness.cli.shared_options import SCENE_HELP, describe_config, require_output_file
 from springbench.harness.console import print_message, show_activity
+from springbench.harness.execution.early_worker import run_in_early_worker
 from springbench.harness.execution.isolated_call import run_isolated
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
     from springbench.harness.config.sweep_config import RunSpec
     from springbench.harness.execution.worker_process import ProgressCallback
+    from springbench.harness.recording.recorder_interface import RecordingReplay
 
 
 def preview(
@@ -33,12 +37,32 @@ def preview(
     from springbench.harness.execution.worker_process import TaskLimits
 
     run = load_scene_run(scene, size)
-    for line in run_isolated(partial(_draw_preview, run, path), run.find_plugins(), TaskLimits(*DEFAULT_LOAD_LIMITS)):
+    content = run_isolated(partial(_describe_scene, run), run.find_plugins(), TaskLimits(*DEFAULT_LOAD_LIMITS))
+    run_in_early_worker(partial(_draw_preview, content, path), lambda message: None)
+    for line in (*content.lines, f"the picture is {path}"):
         print_message(line)
 
 
-def _draw_preview(run: RunSpec, path: Path, tick: ProgressCallback) -> list[str]:
-    """Draw the scene of a run at its start, and return the messages about it."""
+class _PreviewContent(NamedTuple):
+    """Content of a preview, and messages about the selections."""
+
+    replay: RecordingReplay
+    marks: list[tuple[str, str, NDArray[np.float64]]]
+    facts: list[str]
+    notes: list[tuple[str, str]]
+    camera: tuple[float, float] | None
+    lines: list[str]
+
+
+def _draw_preview(content: _PreviewContent, path: Path, tick: ProgressCallback) -> None:
+    from springbench.harness.report.scene_preview import MarkedPoints, draw_scene_preview  # with PyVista
+
+    marks = [MarkedPoints(*mark) for mark in content.marks]
+    draw_scene_preview(content.replay, marks, content.facts, content.notes, path, camera=content.camera)
+
+
+def _describe_scene(run: RunSpec, tick: ProgressCallback) -> _PreviewContent:
+    """Build the scene of a run, and describe it at its start."""
     import numpy as np
     from springbench.harness.execution import machine_info
     from springbench.harness.recording.local_origin import compute_local_origin, store_relative
@@ -48,7 +72,6 @@ def _draw_preview(run: RunSpec, path: Path, tick: ProgressCallback) -> list[str]
         list_obstacles,
     )
     from springbench.harness.recording.strain_scale import DEFAULT_STRAIN_RANGE
-    from springbench.harness.report.scene_preview import MarkedPoints, draw_scene_preview
     from springbench.harness.scenes.scene_builder import build_scene
     from springbench.harness.scenes.vertex_selectors import find_selections
 
@@ -95,13 +118,11 @@ def _draw_preview(run: RunSpec, path: Path, tick: ProgressCallback) -> list[str]
     facts += ["what is chosen twice has the later colour"] if len(set(named)) < len(named) else []
     camera, positions = scene.camera, replay.positions[0].astype(np.float64)
     marks = [
-        MarkedPoints(
-            f"{name}: {len(vertices):,} {'vertex' if len(vertices) == 1 else 'vertices'}", words, positions[vertices]
-        )
+        (f"{name}: {len(vertices):,} {'vertex' if len(vertices) == 1 else 'vertices'}", words, positions[vertices])
         for name, words, vertices in choices
     ]
-    draw_scene_preview(replay, marks, facts, notes, path, camera=(camera.azimuth, camera.elevation) if camera else None)
-    return [*lines, f"the picture is {path}"]
+    angles = (camera.azimuth, camera.elevation) if camera else None
+    return _PreviewContent(replay, marks, facts, notes, angles, lines)
 
 
 def _list_selectors(mesh: Any) -> list[tuple[str, str]]:

@@ -9,17 +9,21 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from pprint import pformat
 from typing import Any
 
 import matplotlib
+from matplotlib.backend_bases import get_registered_canvas_class
 from matplotlib.figure import Figure
 from springbench.harness.atomic_files import atomic_write
+from springbench.harness.execution.forked_call import call_in_fork
 from springbench.harness.report.charts.figure_panels import CellMap, CsvRow, CurvePlot, FigurePanel, MeshPicture
 from springbench.harness.report.figures import script_templates
 from springbench.harness.report.figures.figure_layout import FIGURE_RC, MILLIMETRES_PER_INCH
-from springbench.harness.report.figures.figure_options import FigureOptions
+from springbench.harness.report.figures.figure_options import FIGURE_FORMATS, FigureOptions
 from springbench.harness.report.figures.panel_drawing import RASTER_DPI
 from springbench.harness.report.picture_sources import SOURCES_KEY
 
@@ -42,17 +46,25 @@ def write_figure(
     about = "; ".join(
         dict.fromkeys(words for panel in panels for words in (panel.subject, panel.machine_words) if words)
     )
-    paths = write_images(figure, stem, title, about, options)
-    paths.append(stem.with_name(f"{stem.name}.csv"))
-    _write_csv(paths[-1], [row for panel in panels for row in panel.csv_rows()], [title, about])
-    if isinstance(panels[0], MeshPicture):
-        paths.append(stem.with_name(f"{stem.name}-mesh.csv"))
-        meshes = [panel for panel in panels if isinstance(panel, MeshPicture)]
-        _write_csv(paths[-1], [row for panel in meshes for row in _mesh_rows(panel)], [title, about])
-    paths.append(stem.with_name(f"{stem.name}.py"))
-    with atomic_write(paths[-1]) as partial:
-        partial.write_text(build_script(figure, panels, stem.name, options), encoding="utf-8")
+    first, *rest = sorted(options.formats, key=FIGURE_FORMATS.index)  # PDF takes as long as the others together
+    with call_in_fork(partial(write_images, figure, stem, title, about, replace(options, formats=(first,)))):
+        write_images(figure, stem, title, about, replace(options, formats=tuple(rest)))
+        paths = [stem.with_name(f"{stem.name}.{suffix}") for suffix in (*options.formats, "csv")]
+        _write_csv(paths[-1], [row for panel in panels for row in panel.csv_rows()], [title, about])
+        if isinstance(panels[0], MeshPicture):
+            paths.append(stem.with_name(f"{stem.name}-mesh.csv"))
+            meshes = [panel for panel in panels if isinstance(panel, MeshPicture)]
+            _write_csv(paths[-1], [row for panel in meshes for row in _mesh_rows(panel)], [title, about])
+        paths.append(stem.with_name(f"{stem.name}.py"))
+        with atomic_write(paths[-1]) as target:
+            target.write_text(build_script(figure, panels, stem.name, options), encoding="utf-8")
     return paths
+
+
+def preload_formats() -> None:
+    """Import what writes each format."""
+    for kind in FIGURE_FORMATS:
+        get_registered_canvas_class(kind)
 
 
 def write_images(
@@ -80,8 +92,8 @@ def write_images(
     stem.parent.mkdir(parents=True, exist_ok=True)
     paths = {kind: stem.with_name(f"{stem.name}.{kind}") for kind in options.formats}
     for kind in sorted(paths, key="png".__eq__):  # the PNG last: its digest states that all formats are up to date
-        with matplotlib.rc_context(FIGURE_RC), atomic_write(paths[kind]) as partial:
-            figure.savefig(partial, format=kind, dpi=dpi, metadata=_build_metadata(kind, title, about, sources))
+        with matplotlib.rc_context(FIGURE_RC), atomic_write(paths[kind]) as target:
+            figure.savefig(target, format=kind, dpi=dpi, metadata=_build_metadata(kind, title, about, sources))
     return list(paths.values())
 
 

@@ -1,26 +1,21 @@
-# pyright: reportUnknownMemberType=false
-"""Production of a figure: selection of its panels, composition, checks and output."""
+"""Production of a figure: selection of its panels, and drawing, in the early worker where there is one."""
 
 from __future__ import annotations
 
-from itertools import combinations
+from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
-from matplotlib.figure import Figure
-from matplotlib.text import Text
-from matplotlib.transforms import Bbox
 from springbench.harness.errors import InputError, InputMistake
-from springbench.harness.report.figures import figure_files, panel_selection
-from springbench.harness.report.figures.axis_scales import measure_overlap
-from springbench.harness.report.figures.figure_kinds import FigureKind, StaleFinder
-from springbench.harness.report.figures.figure_layout import compose_figure, visible_texts
-from springbench.harness.report.figures.figure_options import MIN_FONT_SIZE, FigureOptions
+from springbench.harness.execution.early_worker import run_in_early_worker
+from springbench.harness.report.charts.figure_panels import FigurePanel, MeshPicture
+from springbench.harness.report.figures import panel_selection
+from springbench.harness.report.figures.figure_kinds import FIGURE_KINDS, FigureKind, StaleFinder
+from springbench.harness.report.figures.figure_options import FigureOptions
 
-_MAX_LISTED = 3
-"""Maximum number of faults that a message lists."""
-_OVERLAP_SLACK = 0.75
-"""Allowed overlap of text boxes [points], because they are larger than the ink."""
+if TYPE_CHECKING:
+    from springbench.harness.execution.worker_process import ProgressCallback
 
 
 class FigureResult(NamedTuple):
@@ -68,44 +63,24 @@ def make_figure(
         parts = ", ".join(":".join(one.name_parts) for one in picked)
         why = f"got {parts}, of which some are curves and some are maps; expected one of both: their data differ"
         raise InputError(InputMistake(f"{why}; draw the others as a figure of their own", key="--panels"))
-    figure = compose_figure(panels, kind.title, options)
-    wrong = find_layout_faults(figure)
-    if wrong:
-        more = f" and {len(wrong) - _MAX_LISTED} more" if len(wrong) > _MAX_LISTED else ""
-        why = (
-            f"got {options.width_mm:g} mm for type of {options.font_size:g} points, in "
-            f"which {'; '.join(wrong[:_MAX_LISTED])}{more}"
-        )
-        raise InputError(InputMistake(f"{why}; expected a wider figure, smaller type or fewer panels", key="--width"))
     parts = [part for selector in options.selectors for part in selector]
     stem = folder / "-".join(dict.fromkeys([name, *parts]))
-    paths = figure_files.write_figure(figure, panels, stem, kind.title, options)
+    draw = partial(_draw_figure, panels, stem, kind.title, options)
+    is_plain = name in FIGURE_KINDS and not any(isinstance(panel, MeshPicture) for panel in panels)
+    paths, size_mm = run_in_early_worker(draw, _ignore_progress) if is_plain else draw(_ignore_progress)
     rest = [one for one in entries if one not in picked]
     example = ":".join(rest[0].name_parts) if rest else ""
     shown = [":".join(one.name_parts) for one in picked]
-    return FigureResult(paths, shown, figure_files.figure_size_mm(figure), len(rest), example)
+    return FigureResult(paths, shown, size_mm, len(rest), example)
 
 
-def find_layout_faults(figure: Figure) -> list[str]:
-    """Find all layout faults and describe them; empty if the figure is correct."""
-    slack = _OVERLAP_SLACK * figure.dpi / 72.0
-    seen = visible_texts(figure)
-    small = [(text.get_text(), float(text.get_fontsize())) for text in seen]
-    found = [f"{words!r} is of {size:.1f} points" for words, size in small if size < MIN_FONT_SIZE]
-    # The method of Text itself: that of annotations includes their arrows.
-    boxes = [(text.get_text(), Text.get_window_extent(text)) for text in seen]
-    page = figure.bbox
-    for words, box in boxes:
-        out = max(page.x0 - box.x0, box.x1 - page.x1, page.y0 - box.y0, box.y1 - page.y1)
-        if out > slack:
-            found.append(f"{words!r} is cut")
-    met = (f"{a!r} meets {b!r}" for (a, one), (b, other) in combinations(boxes, 2) if _boxes_overlap(one, other, slack))
-    found += met
-    for legend in figure.legends:
-        over = legend.get_window_extent()
-        found += ["the legend lies over data" for ax in figure.axes if _boxes_overlap(over, ax.bbox, slack)]
-    return found
+def _draw_figure(
+    panels: Sequence[FigurePanel], stem: Path, title: str, options: FigureOptions, tick: ProgressCallback
+) -> tuple[list[Path], tuple[float, float]]:
+    from springbench.harness.report.figures.figure_drawing import draw_figure  # with Matplotlib
+
+    return draw_figure(panels, stem, title, options)
 
 
-def _boxes_overlap(one: Bbox, other: Bbox, slack: float) -> bool:
-    return min(measure_overlap(one, other)) > slack
+def _ignore_progress(message: str) -> None:
+    pass

@@ -14,6 +14,8 @@ _MILLIMETRES_PER_UNIT = {"mm": 1.0, "cm": 10.0, "in": 25.4, "pt": 25.4 / 72.0}
 _MIN_WIDTH, _MAX_WIDTH = 40.0, 400.0
 """Minimum and maximum width [mm]: below there is no space for text, and no page is wider."""
 FIGURE_FORMATS = ("pdf", "svg", "png")
+MESH_KINDS = frozenset({"run", "comparison", "scenes"})
+"""Kinds of figures that show meshes, which the process that selects them draws."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,0 +1,42 @@
+"""Import of the modules that draw the pictures of a sweep, in the process that draws them."""
+
+from __future__ import annotations
+
+from importlib import import_module
+
+from springbench.harness.execution.timing_lock import lock_timing_shared
+from springbench.harness.report import opengl_probe
+
+_CHART_MODULES = (
+    "numpy",
+    "matplotlib.figure",
+    "springbench.harness.report.sweep_pictures",
+    "springbench.harness.report.timing_plot",
+)
+_SCENE_MODULES = (
+    "pyvista",
+    "pyvista.plotting",
+    "springbench.harness.report.run_picture",
+    "springbench.harness.recording.recording_reader",
+)
+
+
+def preload_drawing() -> None:
+    """Import the drawing modules one after the other, none of them while a run is timed."""
+    with lock_timing_shared(_ignore_progress):
+        opengl_probe.start_opengl_probe()
+    _import_untimed(_CHART_MODULES)
+    with lock_timing_shared(_ignore_progress):
+        problem = opengl_probe.find_opengl_problem()
+    if problem is None:
+        _import_untimed(_SCENE_MODULES)
+
+
+def _import_untimed(modules: tuple[str, ...]) -> None:
+    for module in modules:
+        with lock_timing_shared(_ignore_progress):
+            import_module(module)
+
+
+def _ignore_progress(message: str) -> None:
+    pass
