@@ -45,7 +45,7 @@ def take_early_worker(initialiser: Callable[[], object]) -> IsolatedWorker:
 
 
 def run_in_early_worker(task: TaskFunction, tick: ProgressCallback) -> Any:
-    """Return the value of a task, which runs in the early worker, or in this process without one.
+    """Return the value of a task that runs in the early worker, or here without one.
 
     Args:
         task: function of the task; picklable.

@@ -1,4 +1,4 @@
-"""Import of the modules that draw the pictures of a sweep, in the process that draws them."""
+"""Import of the modules that draw pictures, in the process that draws them."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _SCENE_MODULES = (
 
 
 def preload_drawing() -> None:
-    """Import the drawing modules one after the other, none of them while a run is timed."""
+    """Import what draws the pictures of a sweep, no module while a run is timed."""
     with lock_timing_shared(_ignore_progress):
         opengl_probe.start_opengl_probe()
     _import_untimed(_CHART_MODULES)
@@ -30,6 +30,12 @@ def preload_drawing() -> None:
         problem = opengl_probe.find_opengl_problem()
     if problem is None:
         _import_untimed(_SCENE_MODULES)
+
+
+def preload_preview() -> None:
+    """Import the modules that draw the preview of a scene."""
+    opengl_probe.start_opengl_probe()
+    import_module("springbench.harness.report.scene_preview")
 
 
 def _import_untimed(modules: tuple[str, ...]) -> None:

@@ -12,7 +12,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from types import TracebackType
-from typing import Any, NamedTuple, cast
+from typing import Any, ClassVar, NamedTuple, cast
 
 import numpy as np
 import pyvista as pv
@@ -211,9 +211,14 @@ class OffscreenRenderer:
         mesh_lines: pixels per vertex from which on mesh lines are drawn.
         background: background colour; None for a transparent background without a shadow.
 
+    Attributes:
+        was_opened: whether this process has opened a window.
+
     Raises:
         RunFailed: if the system cannot draw.
     """
+
+    was_opened: ClassVar[bool] = False
 
     def __init__(
         self,
@@ -224,6 +229,7 @@ class OffscreenRenderer:
         background: str | None = BACKGROUND_COLOUR,
     ) -> None:
         opengl_probe.require_opengl()
+        OffscreenRenderer.was_opened = True
         self._mesh_lines, self._page = mesh_lines, background
         self._pixels, self._height = width * height, height
         size = [_SUPERSAMPLING * width, _SUPERSAMPLING * height]

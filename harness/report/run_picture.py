@@ -8,7 +8,9 @@ neighbours of a pin most of a mesh would be grey, and on a scale that is too sho
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from math import ceil
 from pathlib import Path
 from typing import NamedTuple
@@ -18,6 +20,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from numpy.typing import NDArray
+from springbench.harness.execution.forked_call import start_in_fork
 from springbench.harness.recording.camera_framing import describe_outside
 from springbench.harness.recording.recorder_interface import RecordingReplay
 from springbench.harness.report.drawable_frames import (
@@ -169,20 +172,36 @@ def _draw_frames(
     angles = choose_view_angles(points, compute_area_vectors(replay, final)) if camera is None else camera
     last, every = points_to_frame(replay, [final]), points_to_frame(replay, (*earlier, final))
     main, tiles = layout_frames(view_aspect(last, angles), view_aspect(every, angles), len(earlier))
-    close = fit_camera(last, aspect=main.width / main.height, angles=angles)
-    with OffscreenRenderer(main.width, main.height) as studio:
-        paste_picture(page, studio.render_frame(replay, final, close), main.left, main.top)
+    render_tiles = partial(_render_frames, replay, earlier, every, angles, tiles)
+    # The first picture of a process is rendered on two cores; OpenGL, once it is used, does not survive a fork.
+    wait_for_tiles = render_tiles if OffscreenRenderer.was_opened else start_in_fork(render_tiles)
+    (picture,) = _render_frames(replay, [final], last, angles, [main])
+    paste_picture(page, picture, main.left, main.top)
     draw_text(page, main.left + 4, main.top + main.height - 4, format_frame_time(replay, final), size=11.5)
     if not tiles:
         return
-    whole = fit_camera(every, aspect=tiles[0].width / tiles[0].height, angles=angles)
     x, ends = (tiles[0].left - _RULE_GAP / 2) / PAGE_WIDTH, (main.top + 4, main.top + main.height - 4)
     page.add_artist(Line2D([x, x], [1 - y / PAGE_HEIGHT for y in ends], color=RULE_COLOUR, linewidth=0.8))
-    with OffscreenRenderer(tiles[0].width, tiles[0].height) as studio:
-        for frame, tile in zip(earlier, tiles, strict=True):
-            paste_picture(page, studio.render_frame(replay, frame, whole), tile.left, tile.top)
-            words = format_frame_time(replay, frame)
-            draw_text(page, tile.left + 4, tile.top + tile.height + 14, words, size=10, color=MUTED_COLOUR)
+    for frame, tile, pixels in zip(earlier, tiles, wait_for_tiles(), strict=True):
+        paste_picture(page, pixels, tile.left, tile.top)
+        words = format_frame_time(replay, frame)
+        draw_text(page, tile.left + 4, tile.top + tile.height + 14, words, size=10, color=MUTED_COLOUR)
+
+
+def _render_frames(
+    replay: RecordingReplay,
+    frames: Sequence[int],
+    points: NDArray[np.floating],
+    angles: tuple[float, float],
+    boxes: Sequence[PixelBox],
+) -> list[NDArray[np.uint8]]:
+    """Render frames for boxes of one size, with a camera that sees the points (q, 3) [m]."""
+    if not boxes:
+        return []
+    box = boxes[0]
+    view = fit_camera(points, aspect=box.width / box.height, angles=angles)
+    with OffscreenRenderer(box.width, box.height) as studio:
+        return [studio.render_frame(replay, frame, view) for frame in frames]
 
 
 def _draw_blow_up_notice(page: Figure, replay: RecordingReplay, good: int) -> None:

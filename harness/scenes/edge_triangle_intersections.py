@@ -115,7 +115,7 @@ def _list_near_boxes(a: FloatArray, b: FloatArray) -> Iterator[tuple[IndexArray,
 
 
 def _list_near_spheres(a: FloatArray, b: FloatArray) -> Iterator[tuple[IndexArray, IndexArray]]:
-    """Yield edges a (m, 2, 3) and triangles b (f, 3, 3) with overlapping bounding spheres, by index, in chunks."""
+    """Yield chunks of edges a (m, 2, 3) and triangles b (f, 3, 3) whose bounding spheres overlap, by index."""
     from scipy.spatial import cKDTree  # slow to import
 
     middle, centre = a.mean(axis=1), b.mean(axis=1)

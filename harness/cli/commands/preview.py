@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 import typer
 from springbench.harness.cli.shared_options import SCENE_HELP, describe_config, require_output_file
 from springbench.harness.console import print_message, show_activity
-from springbench.harness.execution.early_worker import run_in_early_worker
 from springbench.harness.execution.isolated_call import run_isolated
 
 if TYPE_CHECKING:
@@ -34,6 +33,7 @@ def preview(
     show_activity("drawing the scene")
     from springbench.harness.config.config_loader import load_scene_run
     from springbench.harness.config.user_code import DEFAULT_LOAD_LIMITS
+    from springbench.harness.execution.early_worker import run_in_early_worker
     from springbench.harness.execution.worker_process import TaskLimits
 
     run = load_scene_run(scene, size)

@@ -26,7 +26,7 @@ _OVERLAP_SLACK = 0.75
 def draw_figure(
     panels: Sequence[FigurePanel], stem: Path, title: str, options: FigureOptions
 ) -> tuple[list[Path], tuple[float, float]]:
-    """Draw panels as a figure, write its files, and return them with its width and height [mm].
+    """Draw a figure, and return its files and its width and height [mm].
 
     Args:
         panels: panels, all of one type.
@@ -50,7 +50,7 @@ def draw_figure(
     return figure_files.write_figure(figure, panels, stem, title, options), figure_files.figure_size_mm(figure)
 
 
-def preload_drawing() -> None:
+def preload_figures() -> None:
     """Import what draws and writes figures."""
     figure_files.preload_formats()
 

@@ -19,7 +19,7 @@ import matplotlib
 from matplotlib.backend_bases import get_registered_canvas_class
 from matplotlib.figure import Figure
 from springbench.harness.atomic_files import atomic_write
-from springbench.harness.execution.forked_call import call_in_fork
+from springbench.harness.execution.forked_call import start_in_fork
 from springbench.harness.report.charts.figure_panels import CellMap, CsvRow, CurvePlot, FigurePanel, MeshPicture
 from springbench.harness.report.figures import script_templates
 from springbench.harness.report.figures.figure_layout import FIGURE_RC, MILLIMETRES_PER_INCH
@@ -47,17 +47,18 @@ def write_figure(
         dict.fromkeys(words for panel in panels for words in (panel.subject, panel.machine_words) if words)
     )
     first, *rest = sorted(options.formats, key=FIGURE_FORMATS.index)  # PDF takes as long as the others together
-    with call_in_fork(partial(write_images, figure, stem, title, about, replace(options, formats=(first,)))):
-        write_images(figure, stem, title, about, replace(options, formats=tuple(rest)))
-        paths = [stem.with_name(f"{stem.name}.{suffix}") for suffix in (*options.formats, "csv")]
-        _write_csv(paths[-1], [row for panel in panels for row in panel.csv_rows()], [title, about])
-        if isinstance(panels[0], MeshPicture):
-            paths.append(stem.with_name(f"{stem.name}-mesh.csv"))
-            meshes = [panel for panel in panels if isinstance(panel, MeshPicture)]
-            _write_csv(paths[-1], [row for panel in meshes for row in _mesh_rows(panel)], [title, about])
-        paths.append(stem.with_name(f"{stem.name}.py"))
-        with atomic_write(paths[-1]) as target:
-            target.write_text(build_script(figure, panels, stem.name, options), encoding="utf-8")
+    finish_first = start_in_fork(partial(write_images, figure, stem, title, about, replace(options, formats=(first,))))
+    write_images(figure, stem, title, about, replace(options, formats=tuple(rest)))
+    paths = [stem.with_name(f"{stem.name}.{suffix}") for suffix in (*options.formats, "csv")]
+    _write_csv(paths[-1], [row for panel in panels for row in panel.csv_rows()], [title, about])
+    if isinstance(panels[0], MeshPicture):
+        paths.append(stem.with_name(f"{stem.name}-mesh.csv"))
+        meshes = [panel for panel in panels if isinstance(panel, MeshPicture)]
+        _write_csv(paths[-1], [row for panel in meshes for row in _mesh_rows(panel)], [title, about])
+    paths.append(stem.with_name(f"{stem.name}.py"))
+    with atomic_write(paths[-1]) as target:
+        target.write_text(build_script(figure, panels, stem.name, options), encoding="utf-8")
+    finish_first()
     return paths
 
 

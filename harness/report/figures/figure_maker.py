@@ -1,4 +1,4 @@
-"""Production of a figure: selection of its panels, and drawing, in the early worker where there is one."""
+"""Production of a figure: selection of its panels, and drawing, in another process if possible."""
 
 from __future__ import annotations
 
