@@ -45,7 +45,9 @@ def take_early_worker(initialiser: Callable[[], object]) -> IsolatedWorker:
 
 
 def run_in_early_worker(task: TaskFunction, tick: ProgressCallback) -> Any:
-    """Return the value of a task that runs in the early worker, or here without one.
+    """Return the value of a task of the early worker.
+
+    Without one, the task runs in this process.
 
     Args:
         task: function of the task; picklable.

@@ -16,7 +16,7 @@ Value = TypeVar("Value")
 
 
 def start_in_fork(function: Callable[[], Value]) -> Callable[[], Value]:
-    """Start a function in a fork of this process, and return what waits for its value.
+    """Start a function in a fork, and return what waits for its value.
 
     Where a fork is unsafe, or has failed, waiting calls the function in this process, with its errors.
 

@@ -100,7 +100,7 @@ _QUERY = ("query", "select solver, count(*) from rows group by solver", "--resul
 _NO_KERNELS = {"NUMBA_CACHE_DIR": "FOLDER"}
 _IN_PROCESS = ("-m", "tests.bench.latency", "--in-process")
 
-_OF_A_RERUN = "half in the processes that draw, with PyVista and Matplotlib; most of the rest imports"
+_OF_A_RERUN = "a third imports, a third is the run with its kernels and Rerun, a quarter draws its picture"
 _OF_A_FIRST_RUN = "three quarters compile kernels, on all cores; the rest is that of a warm run"
 
 LATENCY_ROWS = {
@@ -138,7 +138,7 @@ LATENCY_ROWS = {
         1.5,
         ("figure", "timing", "RESULTS/quickstart", "-o", "RESULTS/figures"),
         (_SWEEP,),
-        limit="Matplotlib: a third writes PDF, SVG and PNG, a sixth imports it, a tenth places labels",
+        limit="half imports, in two processes, and reads rows; a quarter writes the PDF, a sixth composes",
     ),
     "preview": LatencyRow(
         "preview",
@@ -146,7 +146,7 @@ LATENCY_ROWS = {
         ("preview", "hanging-cloth", "-o", "RESULTS/quickstart/preview.png"),
         (_SWEEP,),
         cold="the picture",
-        limit="three quarters import PyVista with VTK, Matplotlib, NumPy and Pydantic; a sixth opens the renderer",
+        limit="half imports Matplotlib and PyVista with VTK, in another process; a quarter renders",
     ),
     "error-search": LatencyRow(
         "run --error 1e-4, hanging cloth of 17",
