@@ -8,8 +8,6 @@ from springbench.harness.execution.timing_lock import lock_timing_shared
 from springbench.harness.report import opengl_probe
 
 _CHART_MODULES = (
-    "numpy",
-    "matplotlib.figure",
     "springbench.harness.report.sweep_pictures",
     "springbench.harness.report.timing_plot",
 )
@@ -25,9 +23,9 @@ def preload_drawing() -> None:
     """Import what draws the pictures of a sweep, no module while a run is timed."""
     with lock_timing_shared(_ignore_progress):
         opengl_probe.start_opengl_probe()
-    _import_untimed(_CHART_MODULES)
-    with lock_timing_shared(_ignore_progress):
+        import_module("matplotlib.figure")
         problem = opengl_probe.find_opengl_problem()
+    _import_untimed(_CHART_MODULES)
     if problem is None:
         _import_untimed(_SCENE_MODULES)
 
