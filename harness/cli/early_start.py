@@ -11,7 +11,7 @@ def start_early(arguments: Sequence[str]) -> bool:
     """Start a command, and return whether it is complete.
 
     `list` and `schema` without arguments are complete. For `query`, the process that executes it starts; for
-    commands that draw, the one that draws.
+    commands that draw or record, the one that does so.
 
     Args:
         arguments: command and its arguments.

@@ -126,33 +126,29 @@ def run(
     require_output_file(positions, ".npz", "--positions")
     with_error = {"t_end": t_end, "verify": verify, "compare": compare}
     if max_error is not None:
-        from springbench.harness.experiments.error_control.motion_recording import MotionRecorder
+        from springbench.harness.cli.commands.error_control import ErrorRequest, run_error_control
 
-        with MotionRecorder() as recorder:
-            from springbench.harness.cli.commands.error_control import ErrorRequest, run_error_control
-
-            is_accurate = run_error_control(
-                config,
-                ErrorRequest(
-                    error=max_error,
-                    t_end=t_end,
-                    size=size[0] if size else None,
-                    verify=verify,
-                    compare_third_party=compare,
-                    positions=positions,
-                    rerun=rerun,
-                ),
-                results,
-                print_message,
-                {
-                    "solver": solver,
-                    "scheduler": scheduler,
-                    "workers": workers,
-                    **context.obj,
-                    "size (more than one)": (size or [])[1:],
-                },
-                recorder,
-            )
+        is_accurate = run_error_control(
+            config,
+            ErrorRequest(
+                error=max_error,
+                t_end=t_end,
+                size=size[0] if size else None,
+                verify=verify,
+                compare_third_party=compare,
+                positions=positions,
+                rerun=rerun,
+            ),
+            results,
+            print_message,
+            {
+                "solver": solver,
+                "scheduler": scheduler,
+                "workers": workers,
+                **context.obj,
+                "size (more than one)": (size or [])[1:],
+            },
+        )
         raise typer.Exit(0 if is_accurate else 1)
     if name := next((name for name, value in with_error.items() if value), None):
         key = f"--{name.replace('_', '-')}"

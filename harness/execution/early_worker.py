@@ -6,6 +6,7 @@ It imports the libraries of a later task while this process imports those of the
 from __future__ import annotations
 
 import atexit
+import os
 from collections.abc import Callable
 from typing import Any
 
@@ -15,7 +16,9 @@ from springbench.harness.execution.worker_process import ProgressCallback, TaskF
 from springbench.solvers.platform_calls import can_isolate_processes
 
 _EARLY_WORKERS = list[IsolatedWorker]()
-"""The worker, if it was started."""
+"""The worker, if it was started; forks of this process have none."""
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_EARLY_WORKERS.clear)
 
 
 def start_early_worker(initialiser: Callable[[], object]) -> None:
@@ -61,4 +64,13 @@ def run_in_early_worker(task: TaskFunction, tick: ProgressCallback) -> Any:
     try:
         return _EARLY_WORKERS[0].run_task(task, tick, TaskLimits())
     except TaskFailure as lost:
-        raise RunFailed(f"the process that draws {lost}") from None
+        raise RunFailed(f"the process that draws or records {lost}") from None
+
+
+def wait_for_early_worker() -> None:
+    """Wait until the early worker has imported its libraries, which would disturb timings."""
+    run_in_early_worker(_do_nothing, _do_nothing)
+
+
+def _do_nothing(argument: object) -> None:
+    pass

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from springbench.harness.cli import early_drawing
 from springbench.harness.cli.early_drawing import start_drawing
 from springbench.harness.errors import InputError, RunFailed
 from springbench.harness.execution import early_worker, isolated_worker
@@ -71,7 +72,7 @@ def test_the_early_worker_is_taken_once(workers: list[isolated_worker.IsolatedWo
         ("preview hanging-cloth", True),
         ("run hanging-cloth --rerun", True),
         ("run hanging-cloth", False),
-        ("run hanging-cloth --error=1e-4 --rerun", False),
+        ("run hanging-cloth --error=1e-4", True),
     ],
 )
 def test_the_process_that_draws_starts_where_the_command_draws(
@@ -79,6 +80,7 @@ def test_the_process_that_draws_starts_where_the_command_draws(
 ) -> None:
     begun = list[object]()
     monkeypatch.setattr(early_worker, "start_early_worker", begun.append)
+    monkeypatch.setattr(early_drawing, "list_usable_cores", lambda: [0, 1])
     start_drawing(command.split())
     assert len(begun) == starts
 

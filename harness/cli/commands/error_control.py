@@ -16,6 +16,7 @@ from springbench.harness.config.config_loader import load_scene
 from springbench.harness.config.sweep_config import FixedOptions
 from springbench.harness.errors import InputError, InputMistake, RunFailed
 from springbench.harness.execution import machine_info
+from springbench.harness.execution.early_worker import run_in_early_worker, wait_for_early_worker
 from springbench.harness.execution.isolated_call import run_isolated
 from springbench.harness.execution.optional_parts import RECORDINGS
 from springbench.harness.execution.worker_process import TaskLimits
@@ -31,7 +32,6 @@ from springbench.harness.experiments.error_control.method_search import (
     search_cheapest_method,
 )
 from springbench.harness.experiments.error_control.method_trials import SearchResult, Trial
-from springbench.harness.experiments.error_control.motion_recording import MotionRecorder
 from springbench.harness.experiments.error_control.stored_trials import (
     ResultRow,
     build_trial_rows,
@@ -41,7 +41,7 @@ from springbench.harness.experiments.error_control.stored_trials import (
 )
 from springbench.harness.experiments.kernel_precompilation import ERROR_CONTROL, compile_missing_kernels
 from springbench.harness.experiments.provenance import build_provenance_columns
-from springbench.harness.recording.recorder_interface import RecordingInfo
+from springbench.harness.recording.recorder_interface import RecordedFrame, RecordingInfo
 from springbench.harness.recording.strain_shading import compute_strain_range
 from springbench.harness.reference.perturbation_growth import PerturbationGrowth
 from springbench.harness.reference.self_converged_trajectory import describe_self_convergence
@@ -91,7 +91,6 @@ def run_error_control(
     results: Path,
     print_message: PrintMessage,
     rejected_options: Mapping[str, Any],
-    recorder: MotionRecorder,
 ) -> bool:
     """Simulate the scene in a file to a relative error, and print the cost.
 
@@ -101,7 +100,6 @@ def run_error_control(
         results: folder of results.
         print_message: prints a message.
         rejected_options: other options on the command line, which are not supported here.
-        recorder: records the motion; for a scene with user code another one does.
 
     Returns:
         Whether energy has grown only by its sources and, if it is verified, the measured error is at most the requested
@@ -113,13 +111,10 @@ def run_error_control(
     """
     _check_options(request.error, request.t_end, rejected_options)
     scene = load_scene(config)
-    plugins = scene.find_plugins()
-    if plugins:
-        recorder = MotionRecorder(has_process=False)
-    recorder.wait_for_import()
+    wait_for_early_worker()
     return run_isolated(
-        partial(_execute_error_control, config, scene, request, results, recorder),
-        plugins,
+        partial(_execute_error_control, config, scene, request, results),
+        scene.find_plugins(),
         TaskLimits(FixedOptions().time_limit),
         print_message,
     )
@@ -130,7 +125,6 @@ def _execute_error_control(
     scene: SceneSpec,
     request: ErrorRequest,
     results: Path,
-    recorder: MotionRecorder,
     print_message: PrintMessage,
 ) -> bool:
     error = request.error
@@ -178,7 +172,7 @@ def _execute_error_control(
     row |= {name: value for name, value in energies.columns.items() if name in _ENERGY_COLUMNS}
     if RECORDINGS.is_installed():
         recording = _record_motion(
-            recorder, folder / "recordings" / f"{label}.rrd", config.stem, error_target, motion_scene, answer, status
+            folder / "recordings" / f"{label}.rrd", config.stem, error_target, motion_scene, answer, status
         )
         row["recording_path"] = f"recordings/{recording.name}"
         print_message(f"the recording is {recording}")
@@ -349,7 +343,6 @@ def _build_third_party_rows(
 
 
 def _record_motion(
-    recorder: MotionRecorder,
     path: Path,
     name: str,
     error_target: ErrorTarget,
@@ -389,4 +382,19 @@ def _record_motion(
             "commit": machine_info.read_commit(),
         },
     )
-    return recorder.write_recording(path, info, best.trajectory.positions)
+    task = partial(_write_recording, path, info, best.trajectory.positions)
+    return run_in_early_worker(task, lambda message: None)
+
+
+def _write_recording(path: Path, info: RecordingInfo, positions: Positions, tick: PrintMessage) -> Path:
+    """Write the recording of positions (frames, n, 3) [m], and return its path."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    from springbench.harness.recording.rerun_recorder import RerunRecorder
+
+    recorder = RerunRecorder(path, info)
+    try:
+        for k, p in enumerate(positions):
+            recorder.record_frame(RecordedFrame(k, k * info.time_step, p, {}, float("nan"), 0))
+        return recorder.finish_recording({})
+    finally:
+        recorder.abandon_recording()
