@@ -1,8 +1,12 @@
-"""Start of the process that draws or records, which imports its libraries while the command starts."""
+"""Start of the process that draws or records.
+
+It imports its libraries while the command starts.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from importlib import import_module
 
 from springbench.harness.execution.optional_parts import PICTURES, RECORDINGS
 from springbench.harness.report.figures.figure_options import MESH_KINDS
@@ -10,7 +14,7 @@ from springbench.solvers.platform_calls import list_usable_cores
 
 
 def start_drawing(arguments: Sequence[str]) -> None:
-    """Start the process that draws or records, if the command will need it and there is a core for it.
+    """Start the process that draws or records, if the command needs it and there is a core for it.
 
     Args:
         arguments: command and its arguments.
@@ -56,4 +60,4 @@ def _preload_sweep() -> None:
 
 
 def _preload_recording() -> None:
-    import springbench.harness.recording.rerun_recorder  # noqa: F401
+    import_module("springbench.harness.recording.rerun_recorder")

@@ -60,7 +60,10 @@ class LinkedLibrary(_LIBRARY_CLASS):
 
 
 class KernelLibrary(_LIBRARY_CLASS):
-    """Code that only Python calls: stored as machine code, without the bitcode for linking it into other code."""
+    """Code that only Python calls.
+
+    It is stored as machine code, without the bitcode for linking it into other code.
+    """
 
     def serialize_using_object_code(self) -> tuple[str, str, tuple[bytes, list[str]]]:
         """Return the machine code, and the names that it defines."""
