@@ -14,7 +14,9 @@ from springbench.solvers.platform_calls import list_usable_cores
 
 
 def start_drawing(arguments: Sequence[str]) -> None:
-    """Start the process that draws or records, if the command needs it and there is a core for it.
+    """Start the process that draws or records, if the command needs it.
+
+    On a single core it does not start early.
 
     Args:
         arguments: command and its arguments.
