@@ -21,6 +21,7 @@ from springbench.harness.execution.optional_parts import PICTURES
 from springbench.harness.execution.progress_display import ThrottledMessages
 from springbench.harness.execution.timing_lock import lock_timing_shared
 from springbench.harness.execution.worker_pool import PoolTask, run_tasks
+from springbench.harness.execution.worker_process import TaskFunction
 from springbench.harness.report.citations import write_bibtex
 from springbench.harness.report.picture_sources import digest_runs, read_sources
 from springbench.harness.report.varying_settings import find_varying_keys
@@ -75,12 +76,14 @@ def draw_sweep_pictures(
     missing = _load_drawing() if wanting or any(group.has_outdated_picture for group in groups) else None
     if missing:
         print_message(missing)
-    if wanting and not missing:
+        wanting = []
+    if wanting:
         print_message(f"drawing the pictures of {len(wanting)} runs")
-        _draw_run_pictures(wanting, print_message, num_concurrent, times)
-    else:
-        times()
-    _draw_group_comparisons(groups, print_message, pictures=not missing)
+    tasks = [
+        *(_DrawingTask(p.picture_path, partial(_draw_job, p)) for p in wanting),
+        *(_DrawingTask(group.recording_path, partial(_draw_comparison, group, not missing)) for group in groups),
+    ]
+    _draw_in_parallel(tasks, print_message, num_concurrent, times)
 
 
 def _load_drawing() -> str | None:
@@ -93,52 +96,53 @@ def _load_drawing() -> str | None:
     return opengl_probe.find_opengl_problem()
 
 
-def _draw_run_pictures(
-    pending_jobs: Sequence[PictureJob],
+class _DrawingTask(NamedTuple):
+    """A file, and the function that draws it."""
+
+    path: Path
+    draw: TaskFunction
+
+
+def _draw_in_parallel(
+    tasks: Sequence[_DrawingTask],
     print_message: Callable[[str], None],
     num_concurrent: int,
     run_meanwhile: Callable[[], None],
 ) -> None:
-    """Draw the pictures of runs in parallel processes, and report why a process was lost."""
+    """Draw in parallel processes, and report why a process was lost."""
+    if not tasks:
+        run_meanwhile()
+        return
     done, remarks = 0, ThrottledMessages(print_message)
 
     def tick(message: str) -> None:
-        remarks(f"{done} of {len(pending_jobs)} pictures are drawn")
+        remarks(f"{done} of {len(tasks)} pictures and comparisons are drawn")
 
-    tasks = [PoolTask(partial(_draw_job, p), tick, TaskLimits()) for p in pending_jobs]
+    pool_tasks = [PoolTask(task.draw, tick, TaskLimits()) for task in tasks]
     for number, outcome in run_tasks(
-        num_concurrent, int, [None] * len(tasks), lambda number: tasks[number], run_meanwhile
+        num_concurrent, int, [None] * len(tasks), lambda number: pool_tasks[number], run_meanwhile
     ):
         done += 1
         if isinstance(outcome, TaskFailure):
-            print_message(f"{pending_jobs[number].picture_path} is not drawn: its process {outcome}")
+            print_message(f"{tasks[number].path} is not drawn: its process {outcome}")
 
 
-def _draw_group_comparisons(
-    groups: Sequence[SolverGroup], print_message: Callable[[str], None], *, pictures: bool
-) -> None:
-    """Create the side-by-side recordings of groups, and their pictures if `pictures` is true."""
-    if not groups:
-        return
+def _draw_comparison(group: SolverGroup, has_pictures: bool, tick: ProgressCallback) -> None:
+    """Create the side-by-side recording of a group, and its picture if pictures can be drawn."""
     from springbench.harness.recording.recording_reader import read_replay
     from springbench.harness.recording.side_by_side import LineStyle, write_side_by_side
     from springbench.harness.report.comparison_picture import draw_comparison_picture
     from springbench.harness.report.plot_style import assign_label_shades
 
-    remarks = ThrottledMessages(print_message)
-    for number, group in enumerate(groups):
-        remarks(f"{number} of {len(groups)} comparisons of solvers are drawn")
-        with lock_timing_shared(_ignore_progress):
-            if group.has_outdated_recording:
-                found = assign_label_shades((name, p.run.solver.name) for name, p in group.jobs_by_label.items())
-                looks = {name: LineStyle(mark.color) for name, mark in found.items()}
-                write_side_by_side(
-                    group.recording_path, group.recording_paths, group.group_label.replace("-", " "), looks
-                )
-            if group.has_outdated_picture and pictures:
-                draw_comparison_picture(
-                    {name: read_replay(path) for name, path in group.recording_paths.items()}, group.picture_path
-                )
+    with lock_timing_shared(tick):
+        if group.has_outdated_recording:
+            found = assign_label_shades((name, p.run.solver.name) for name, p in group.jobs_by_label.items())
+            looks = {name: LineStyle(mark.color) for name, mark in found.items()}
+            write_side_by_side(group.recording_path, group.recording_paths, group.group_label.replace("-", " "), looks)
+        if group.has_outdated_picture and has_pictures:
+            draw_comparison_picture(
+                {name: read_replay(path) for name, path in group.recording_paths.items()}, group.picture_path
+            )
 
 
 def _draw_job(p: PictureJob, tick: ProgressCallback) -> None:
