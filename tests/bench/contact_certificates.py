@@ -23,6 +23,7 @@ from rich.table import Table
 from springbench.harness.report.intersection_certificates import find_certificates
 from springbench.harness.results.parquet_rows import read_rows
 from springbench.harness.results.published_set import TABLE_FILES
+from springbench.harness.results.row_store import list_units
 from springbench.harness.results.run_schema import RUN_SCHEMA
 
 from tests.bench.scripted_study import publish_tables
@@ -39,7 +40,7 @@ def main() -> None:
     options = parser.parse_args()
     found, moments = list[dict[str, Any]](), list[dict[str, Any]]()
     for folder in options.results:
-        rows = read_rows(sorted((folder / "rows").glob("*.parquet")), RUN_SCHEMA)
+        rows = read_rows(list_units(folder / "rows"), RUN_SCHEMA)
         found += [{"sweep": folder.name, **one} for one in find_certificates(rows)]
         moments += rows.select(list(PROVENANCE)).to_pylist()
     table = Table("solver", "runs", "frames", "free of intersections", "steps", "converged", box=SIMPLE_HEAD)
