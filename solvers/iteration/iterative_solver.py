@@ -227,7 +227,7 @@ class IterativeSolver(ABC):
             Unsupported: the system has length constraints, which the method does not support.
         """
         run = self._initial_state(problem)
-        limits, initial_residual, close = iteration_limit(stop.max_iterations), float("nan"), False
+        initial_residual, close = float("nan"), False
         if (stop.rtol is not None or stop.atol > 0.0) and self.residual_iterate != "none":
             near, limit = (
                 _ROUNDOFF_CHECK_FRACTION * self.residual_scale(problem) if stop.roundoff_floor > 0.0 else 0.0,
@@ -238,6 +238,8 @@ class IterativeSolver(ABC):
                 initial_residual = self.residual_at(problem, problem.current_positions) if known is None else known
                 limit, close = max(limit, stop.rtol * initial_residual), stop.rtol <= _MINIMUM_CHECK_RTOL
             limits = LoopLimits(stop.max_iterations, limit, near, iteration_loop.RESIDUAL_EACH)
+        else:
+            limits = iteration_limit(stop.max_iterations)
         count, residual, ended = self._iterate_to_roundoff(run, problem, limits, stop.roundoff_floor)
         # A method that recognises saddles continues from them by itself.
         while close and _has_converged(ended) and not run.can_terminate():
@@ -411,7 +413,7 @@ def compute_max_coordinate(problem: StepProblem) -> float:
     Exactly pinned vertices are on their targets.
     """
     p, (indices, vertices) = problem.initial_guess, problem.system.exact_pins
-    if len(vertices):
+    if p is not problem.current_positions and len(vertices):
         p = p.copy()
         p[vertices] = problem.pin_targets[indices]
     return objective_kernels.compute_max_magnitude(as_kernel_array(p))

@@ -19,7 +19,6 @@ length: this costs a quarter more than the minimum, and halves the number of rou
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache
 from typing import Any
 
 import numpy as np
@@ -197,15 +196,9 @@ def init_rounds(newton_cost: float, check_cost: float, sweep_cost: int = 0, *, s
         sweep_cost: cost of a round of sweeps, in iterations; 0 for no sweeps.
         starts_sweeping: whether the first round consists of sweeps.
     """
-    content = _initial_content(newton_cost, check_cost, sweep_cost, starts_sweeping)  # NumPy copies field by field
-    return np.frombuffer(bytearray(content), ROUND_STATE_DTYPE)
-
-
-@cache
-def _initial_content(newton_cost: float, check_cost: float, sweep_cost: int, starts_sweeping: bool) -> bytes:
     initial = np.zeros(1, ROUND_STATE_DTYPE)
     initial["group_end"] = initial["segment_end"] = GROUP_ITERATIONS
     initial["initial_residual"], initial["gain"] = -1.0, np.inf
     initial["newton_cost"], initial["check_cost"] = newton_cost, check_cost
     initial["sweep_cost"], initial["is_sweeping"] = sweep_cost, starts_sweeping
-    return initial.tobytes()
+    return initial

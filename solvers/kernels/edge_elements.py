@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from springbench.solvers.jit.kernel_compilation import jit_inner, jit_kernel
+from springbench.solvers.jit.typed_kernel import TypedKernel
 from springbench.solvers.kernels.packet_data import copy_aligned, deduplicate_packets
 from springbench.solvers.linalg.memory import allocate_aligned
 from springbench.solvers.model.energies.edge_energy import ZERO_LENGTH, vertex_pair_keys
@@ -76,23 +77,20 @@ class EdgePackets(NamedTuple):
         offset = np.arange(0, data.size, EDGE_STRIDE, dtype=np.int32)
         return self._replace(limit_offset=offset, limit_data=copy_aligned(data))
 
-    def with_directions(self, axis: Positions, offset: NDArray[np.float64]) -> EdgePackets:
-        """Return the packets with other directions and offsets of the dashpots.
+    def with_own_dashpots(self) -> EdgePackets:
+        """Return the packets with arrays of their own for `write_directions`."""
+        data, blocks = (allocate_aligned(len(x)) for x in (self.dashpot_data, self.dashpot_blocks))
+        return self._replace(dashpot_data=data, dashpot_blocks=blocks)
+
+    def write_directions(self, axis: Positions, offset: NDArray[np.float64]) -> None:
+        """Write other directions and offsets of the dashpots.
 
         Args:
             axis: unit directions n of the concatenated dashpots (m, 3).
             offset: offsets o of the concatenated dashpots (m,) [m].
         """
-        data, blocks = allocate_aligned(4 * len(self.dashpot_index)), allocate_aligned(6 * LANES * self._num_packets)
-        scale = np.sqrt(self.dashpot_stiffness)
-        _write_dashpots(
-            self, scale[:, None] * axis[self.first_dashpot], scale * offset[self.first_dashpot], data, blocks
-        )
-        return self._replace(dashpot_data=data, dashpot_blocks=blocks)
-
-    @property
-    def _num_packets(self) -> int:
-        return len(self.packet_start) - 1
+        places = self.packet_start, self.dashpot_index, self.first_dashpot
+        _write_dashpots.call(*places, self.dashpot_stiffness, axis, offset, self.dashpot_data, self.dashpot_blocks)
 
 
 class AttachedEdges(NamedTuple):
@@ -234,21 +232,26 @@ def _rank_repeated(keys: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 @jit_kernel
-def _write_dashpots(edges, axis, offset, data, blocks):
+def write_dashpots(packet_start, dashpot_index, first_dashpot, stiffness, axis, offset, data, blocks):
     """Write m and q of all entries, and the packets' sums of m m'.
 
-    axis: m (d, 3); offset: q (d,).
+    Args:
+        packet_start, dashpot_index, first_dashpot, stiffness: those of `EdgePackets`.
+        axis: unit directions n of the concatenated dashpots (m, 3).
+        offset: their offsets o (m,) [m].
+        data, blocks: the `dashpot_data` and `dashpot_blocks` of `EdgePackets`, overwritten.
     """
-    for b in range(len(edges.packet_start) - 1):
+    for b in range(len(packet_start) - 1):
         for k in range(6 * LANES):
             blocks[6 * LANES * b + k] = 0.0
-        for entry in range(edges.packet_start[b], edges.packet_start[b + 1]):
+        for entry in range(packet_start[b], packet_start[b + 1]):
             for lane in range(LANES):
-                number, at = edges.dashpot_index[LANES * entry + lane], EDGE_STRIDE * entry + lane
+                number, at = dashpot_index[LANES * entry + lane], EDGE_STRIDE * entry + lane
                 m0 = m1 = m2 = q = 0.0
                 if number != 0:
-                    e, sign = abs(number) - 1, 1.0 if number > 0 else -1.0
-                    m0, m1, m2, q = sign * axis[e, 0], sign * axis[e, 1], sign * axis[e, 2], offset[e]
+                    scale, e = np.sqrt(stiffness[abs(number) - 1]), first_dashpot[abs(number) - 1]
+                    along, q = scale if number > 0 else -scale, scale * offset[e]
+                    m0, m1, m2 = along * axis[e, 0], along * axis[e, 1], along * axis[e, 2]
                 data[at], data[at + LANES], data[at + 2 * LANES], data[at + 3 * LANES] = m0, m1, m2, q
                 block = 6 * LANES * b + lane
                 blocks[block] += m0 * m0
@@ -257,6 +260,26 @@ def _write_dashpots(edges, axis, offset, data, blocks):
                 blocks[block + 3 * LANES] += m1 * m1
                 blocks[block + 4 * LANES] += m1 * m2
                 blocks[block + 5 * LANES] += m2 * m2
+
+
+_write_dashpots = TypedKernel(write_dashpots)
+
+
+@jit_kernel
+def sum_squared_stretch(edges, stiffness, p):
+    """Return the sum of k |v|^2 [J] over edges.
+
+    Args:
+        edges: (m, 2).
+        stiffness: k (m,) [N/m].
+        p: positions (n, 3) [m].
+    """
+    total = 0.0
+    for e in range(len(edges)):
+        i, j = edges[e, 0], edges[e, 1]
+        v0, v1, v2 = p[i, 0] - p[j, 0], p[i, 1] - p[j, 1], p[i, 2] - p[j, 2]
+        total += stiffness[e] * (v0 * v0 + v1 * v1 + v2 * v2)
+    return total
 
 
 @jit_inner

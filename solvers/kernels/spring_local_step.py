@@ -130,6 +130,10 @@ class SpringPackets(NamedTuple):
             edges,
         ), first
 
+    def with_own_dashpots(self) -> SpringPackets:
+        """Return the packets with arrays of their own for the dashpots of a step, if there are edges."""
+        return self if self.edges is None else self._replace(edges=self.edges.with_own_dashpots())
+
     def entry_weights(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return k r and k of each entry's springs."""
         pull, k = self.weights.reshape(-1, 2, LANES)[self.weight_offset // (2 * LANES)].transpose(1, 0, 2)

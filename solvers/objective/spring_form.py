@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
+from springbench.solvers.jit.typed_kernel import TypedKernel
 from springbench.solvers.model import system_matrix_assembly
 from springbench.solvers.model.energies.edge_energy import vertex_pair_keys
 from springbench.solvers.model.energies.spring_energy import Springs
@@ -107,7 +108,7 @@ class SpringForm:
         """Return packets whose strain limits and dashpots are those of a step.
 
         Args:
-            packets: packets of the springs, with the edges of this form attached.
+            packets: packets of the springs, with the edges of this form attached; their dashpots are overwritten.
             problem: the step.
         """
         edges = packets.edges
@@ -119,20 +120,30 @@ class SpringForm:
             kinds = tuple({type(e) for e in self.strain_limits})
             limits = [e for e in problem.energies if isinstance(e, kinds)]
             low, high = (np.concatenate([getattr(e, at) for e in limits]) for at in ("min_length", "max_length"))
-            edges = edges.with_limits(low, high)
+            packets = packets._replace(edges=edges.with_limits(low, high))
         if self.dashpots:
             steps = [e for e in problem.energies if isinstance(e, Dashpots)]
-            edges = edges.with_directions(
-                np.concatenate([e.direction for e in steps]), np.concatenate([e.offset for e in steps])
-            )
-        return packets._replace(edges=edges)
+            edges.write_directions(_join_arrays([e.direction for e in steps]), _join_arrays([e.offset for e in steps]))
+        return packets
 
     def edge_energy_scale(self, p: Positions) -> float:
         """Return the sum of k |v|^2 [J] over strain limits and dashpots at p.
 
-        It is the scale of cancellation in their energy; p is (n, 3) [m].
+        It is the scale of cancellation in their energy; p is (n, 3) [m], as of `as_kernel_array`.
         """
-        return sum(float(e.stiffness @ e.edge_lengths(p) ** 2) for e in (*self.strain_limits, *self.dashpots))
+        return self._sum_squared_stretch.call(*self._joined_edges, p)
+
+    @cached_property
+    def _joined_edges(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """The edges of all strain limits and dashpots (m, 2), and their stiffness (m,) [N/m]."""
+        energies = *self.strain_limits, *self.dashpots
+        return np.concatenate([e.edges for e in energies]), np.concatenate([e.stiffness for e in energies])
+
+    @cached_property
+    def _sum_squared_stretch(self) -> TypedKernel:
+        from springbench.solvers.kernels.edge_elements import sum_squared_stretch
+
+        return TypedKernel(sum_squared_stretch)
 
 
 def is_packed_edge(energy: Any) -> bool:
@@ -228,6 +239,11 @@ def _merge_parallel_pairs(springs: Springs) -> Springs:
     stiffness = np.zeros(len(ends))
     np.add.at(stiffness, pair.ravel(), springs.stiffness)
     return _zero_length_springs(ends, stiffness)
+
+
+def _join_arrays(parts: list[NDArray[np.float64]]) -> NDArray[np.float64]:
+    """Return the arrays as one, not a copy if there is only one."""
+    return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
 
 def _zero_length_springs(edges: NDArray[np.int64], stiffness: NDArray[np.float64]) -> Springs:

@@ -77,7 +77,7 @@ def build_network(kind: str, *, has_zero_length: bool = False) -> Network:
     assert packets.edges is not None
     if dashpots:
         joined = (np.concatenate([getattr(e, x) for e in dashpots]) for x in ("direction", "offset"))
-        packets = packets._replace(edges=packets.edges.with_directions(*joined))
+        packets.edges.write_directions(*joined)
     return Network(springs, energies, packets, p, weights)
 
 

@@ -283,7 +283,7 @@ class PreparedCompiledLocalGlobal(IterativeSolver):
         target, force, pins, guess = self.step_arrays(problem, problem.initial_guess)
         step_setup.write_right_hand_side(self.vertex_rows, target, force, pins, right)
         step_setup.init_vectors(self.vertex_rows, work.vectors, p, guess, pins)
-        bundles = self.spring_form.update_edges(self.spring_packets, problem)
+        bundles = self.spring_form.update_edges(self.spring_packets.with_own_dashpots(), problem)
 
         def local() -> NDArray[Any]:
             local_global_iteration.run_blocked_local_step(self.iteration_plan, bundles, a, right, p, b)
@@ -349,7 +349,7 @@ class _CompiledState(SolverState):
         self._prepared, self._problem, self._guess = prepared, problem, guess
         self._arrays, self._spring_packets = (
             prepared.step_arrays(problem, guess),
-            prepared.spring_form.update_edges(prepared.spring_packets, problem),
+            prepared.spring_form.update_edges(prepared.spring_packets.with_own_dashpots(), problem),
         )
         self.positions = np.empty_like(problem.inertial_target)
 

@@ -50,6 +50,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from math import isnan
 from typing import Any, ClassVar, cast
 
 import numpy as np
@@ -68,7 +69,7 @@ from springbench.solvers.iteration.iterative_solver import SolverState
 from springbench.solvers.iteration.phase_clock import get_phase_clock
 from springbench.solvers.iteration.saddle_check import SaddleCheck
 from springbench.solvers.iteration.solver_info import Citation, SolverInfo
-from springbench.solvers.kernels.descent_rounds import GROUP_ITERATIONS, REASON_SWITCH, init_rounds
+from springbench.solvers.kernels.descent_rounds import GROUP_ITERATIONS, REASON_SWITCH, ROUND_STATE_DTYPE, init_rounds
 from springbench.solvers.kernels.iteration_loop import (
     NO_ITERATIONS,
     ONE_ITERATION,
@@ -204,10 +205,7 @@ def _needs_double_precision(metric: ResidualMetric) -> bool:
 class PreparedHybrid(PreparedDescent):
     """The hybrid after the setup for a system."""
 
-    @property
-    def hybrid_iteration(self) -> HybridIteration:
-        """The method."""
-        return cast(HybridIteration, self.method)
+    method: HybridIteration
 
     @cached_property
     def saddle_check(self) -> SaddleCheck:
@@ -221,8 +219,7 @@ class PreparedHybrid(PreparedDescent):
             problem: step whose objective is minimised.
             initial_guess: positions (n, 3) [m], not modified.
         """
-        starts_lower = self.hybrid_iteration.starts_lower
-        return (LbfgsFirstState if starts_lower else HybridState)(self, problem, initial_guess)
+        return (LbfgsFirstState if self.method.starts_lower else HybridState)(self, problem, initial_guess)
 
     def residual_at(self, problem: StepProblem, p: Positions) -> float:
         """Return the residual [J^(1/2)], by L-BFGS if its residuals are those of the metric.
@@ -231,7 +228,7 @@ class PreparedHybrid(PreparedDescent):
             problem: step whose objective is minimised.
             p: positions (n, 3) [m].
         """
-        lbfgs = self.hybrid_iteration.exact_lbfgs
+        lbfgs = self.method.exact_lbfgs
         return lbfgs.residual_at(ignore_barriers(problem), p) if lbfgs else super().residual_at(problem, p)
 
 
@@ -317,7 +314,7 @@ class HybridState(SolverState):
     def _start_points(self) -> None:
         """Start the iteration at the initial guess."""
         self.positions = self._step.apply_exact_pins(self.positions)
-        self._points = self._prepared.hybrid_iteration.iterate_from(self._step, self.positions, self._control)
+        self._points = self._prepared.method.iterate_from(self._step, self.positions, self._control)
 
     @cached_property
     def _step(self) -> StepObjective:
@@ -384,6 +381,8 @@ class LbfgsFirstState(HybridState):
     """
 
     _run: CompiledAccelerationState | None = None
+    _limits: LoopLimits | None = None  # the last ones, and those of rounds
+    _round_limits = ONE_ITERATION
     _num_rounds = 0
     _is_lbfgs_alone = True
 
@@ -397,11 +396,10 @@ class LbfgsFirstState(HybridState):
 
     def _start_run(self, *, measures_guess: bool) -> CompiledAccelerationState:
         """Start L-BFGS; `measures_guess` states whether the residual at the guess is needed."""
-        method = self._prepared.hybrid_iteration
+        method = self._prepared.method
         run = self._run = method.start_lower(self._problem, self.positions, measures_guess=measures_guess)
         self._start, self._rounds = run.positions.copy(), method.init_rounds()
         self._floor = method.round_off(self._start)
-        self._one_round = limit_rounds(ONE_ITERATION, self._floor)
         return run
 
     def run_iterations(self, limits: LoopLimits) -> tuple[int, float, int]:
@@ -418,9 +416,10 @@ class LbfgsFirstState(HybridState):
         if control.must_escape:
             self._end_lbfgs_alone(run, np.inf, REASON_ITERATIONS)
             return super()._advance(limits)
-        limits = self._one_round if limits is ONE_ITERATION else limit_rounds(limits, self._floor)
-        count, residual, ended = run.run_rounds(self._rounds, limits)
-        control.num_iterations, control.residual = count, None if np.isnan(residual) else residual
+        if limits is not self._limits:
+            self._limits, self._round_limits = limits, limit_rounds(limits, self._floor)
+        count, residual, ended = run.run_rounds(self._rounds, self._round_limits)
+        control.num_iterations, control.residual = count, None if isnan(residual) else residual
         self._num_rounds += count
         self.positions = run.positions
         if ended in (REASON_STALLED, REASON_SWITCH) or residual <= self._floor:
@@ -435,7 +434,7 @@ class LbfgsFirstState(HybridState):
 
     def _end_lbfgs_alone(self, run: CompiledAccelerationState, residual: float, ended: int) -> None:
         """End the phase of L-BFGS alone, and continue with the choice between the methods."""
-        method, control = self._prepared.hybrid_iteration, self._control
+        method, control = self._prepared.method, self._control
         control.solver_phases, self._is_lbfgs_alone, self._run = self._count_rounds(), False, None
         self._point = DescentPoint(run.positions.copy(), NO_GRADIENT)
         self.positions = self._point.positions
@@ -453,7 +452,7 @@ class LbfgsFirstState(HybridState):
     def _count_rounds(self) -> dict[str, tuple[int, float, float]]:
         """Count the iterations and the cost of L-BFGS alone."""
         groups = int(self._rounds["num_iterations"][0]) / GROUP_ITERATIONS if self._num_rounds else 0.0
-        return {"lbfgs": (self._num_rounds, groups / self._prepared.hybrid_iteration.newton_cost, 0.0)}
+        return {"lbfgs": (self._num_rounds, groups / self._prepared.method.newton_cost, 0.0)}
 
 
 def limit_rounds(limits: LoopLimits, floor: float) -> LoopLimits:
@@ -585,11 +584,13 @@ class HybridIteration:
         has_sweeps = lbfgs.can_start_lower and bool((metric.free_diagonal <= _MAX_SWEEP_RATIO * inertia).all())
         self.sweep_cost = max(1, round(sweep_cost / lbfgs_cost)) if has_sweeps else 0
         self.starts_sweeping = has_sweeps and bool((metric.free_diagonal <= _SWEEP_FIRST_RATIO * inertia).all())
-        self._check_cost = _COLLISION_CHECK_COST if objective.has_barriers else _RESIDUAL_COST
+        check_cost = _COLLISION_CHECK_COST if objective.has_barriers else _RESIDUAL_COST
+        rounds = init_rounds(self.newton_cost, check_cost, self.sweep_cost, starts_sweeping=self.starts_sweeping)
+        self._initial_rounds = rounds.tobytes()
 
     def init_rounds(self) -> NDArray[Any]:
         """Return the state of the rounds of a solve."""
-        return init_rounds(self.newton_cost, self._check_cost, self.sweep_cost, starts_sweeping=self.starts_sweeping)
+        return np.frombuffer(bytearray(self._initial_rounds), ROUND_STATE_DTYPE)  # `copy` copies field by field
 
     def round_off(self, p: Positions) -> float:
         """Return the residual [J^(1/2)] that rounded positions p (n, 3) [m] leave."""
@@ -802,7 +803,7 @@ class MethodChoice:
         count, residual, ended = self._run.run_rounds(rounds, limit_rounds(limits, self._floor))
         done = int(rounds["num_iterations"][0]) - self._num_lbfgs_iterations
         self._control.add_phase("lbfgs", count, done / GROUP_ITERATIONS / self._method.newton_cost)
-        if self._method.exact_lbfgs and not np.isnan(residual):
+        if self._method.exact_lbfgs and not isnan(residual):
             point, self._control.residual = DescentPoint(self._run.positions.copy(), NO_GRADIENT), residual
         else:
             point = compute_current_point(self._run)

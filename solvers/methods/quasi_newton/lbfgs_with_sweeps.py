@@ -13,7 +13,11 @@ from springbench.solvers.kernels.iteration_loop import LoopLimits
 from springbench.solvers.methods.local_global.accelerated_local_global import AccelerationScheme
 from springbench.solvers.methods.local_global.fused_local_global import PreparedCompiledLocalGlobal
 from springbench.solvers.methods.quasi_newton.sweep_rounds import NOT_STARTED, SweepStep, run_sweep_rounds
-from springbench.solvers.methods.quasi_newton.windowed_acceleration import CompiledAccelerationState, CompiledEngine
+from springbench.solvers.methods.quasi_newton.windowed_acceleration import (
+    AccelerationMemory,
+    CompiledAccelerationState,
+    CompiledEngine,
+)
 from springbench.solvers.methods.vertex_block import vbd
 from springbench.solvers.model.step_problem import Positions, StepProblem
 
@@ -35,25 +39,31 @@ class LbfgsSweepEngine(CompiledEngine):
         self.round_kernel = TypedKernel(run_sweep_rounds)
 
     def _init_state(self, problem: StepProblem, guess: Positions, start: int) -> LbfgsSweepState:
-        return LbfgsSweepState(
-            self, self._free_states, self._take_memory(), self._solve_kernels, self._spring_form, problem, guess, start
-        )
+        return LbfgsSweepState(self, problem, guess, start)
+
+    def _allocate_memory(self) -> AccelerationMemory:
+        made = self.sweeps
+        return *super()._allocate_memory(), SweepStep(made.vertex_rows, made.spectral_radius, made.allocate_memory())
 
 
 class LbfgsSweepState(CompiledAccelerationState):
     """State of a compiled solve whose rounds alternate with sweeps."""
 
-    _sweep_step: SweepStep | None = None
-
-    def __init__(self, engine: LbfgsSweepEngine, *given: Any) -> None:
+    def __init__(self, engine: LbfgsSweepEngine, problem: StepProblem, guess: Positions, start: int) -> None:
         """Start a solve.
 
         Args:
             engine: iteration of the system.
-            given: arguments of `CompiledAccelerationState`.
+            problem: step whose objective is minimised.
+            guess: initial guess (n, 3) [m].
+            start: START_AT_GUESS, START_LOWER or START_LOWER_MEASURED.
         """
-        super().__init__(*given)
-        self._engine = engine
+        super().__init__(engine, problem, guess, start)
+        sweeps: SweepStep = self._memory[2]
+        sweeps.sweep_memory.sweep_scratch.omega[0] = NOT_STARTED
+        if (memory := engine.sweeps.update_packets(sweeps.sweep_memory, problem)) is not sweeps.sweep_memory:
+            sweeps = sweeps._replace(sweep_memory=memory)
+        self._round_kernel, self._sweeps = engine.round_kernel, sweeps
 
     def run_rounds(self, rounds: NDArray[Any], limits: LoopLimits) -> tuple[int, float, int]:
         """Run rounds of iterations within the limits, compiled.
@@ -62,18 +72,4 @@ class LbfgsSweepState(CompiledAccelerationState):
             rounds: state of the rounds (1,), updated.
             limits: limits, in rounds.
         """
-        self._sweep_step = sweep_step = self._sweep_step or self._start_sweeps()
-        return self._engine.round_kernel.call(*self._state, sweep_step, rounds, limits, self.positions)
-
-    def _start_sweeps(self) -> SweepStep:
-        """Return the data of the sweeps in this solve."""
-        made = self._engine.sweeps
-        memory = made.take_memory()
-        memory.sweep_scratch.omega[0] = NOT_STARTED
-        blocks = made.update_packets(self._problem)
-        return SweepStep(blocks, made.vertex_rows, made.spectral_radius, memory, *self._step_arrays)
-
-    def __del__(self) -> None:
-        super().__del__()
-        if self._sweep_step is not None:
-            self._engine.sweeps.free_memory.append(self._sweep_step.sweep_memory)
+        return self._round_kernel.call(*self._state, self._sweeps, self._step_arrays, rounds, limits, self.positions)

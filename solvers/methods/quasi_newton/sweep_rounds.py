@@ -12,8 +12,6 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
 from springbench.solvers.jit.kernel_compilation import jit_inner, jit_kernel
 from springbench.solvers.kernels.accelerated_descent import AccelerationWindow, accept_trial
 from springbench.solvers.kernels.descent_rounds import build_compiled_rounds
@@ -27,7 +25,7 @@ from springbench.solvers.methods.quasi_newton.accelerated_step import (
     step_state,
 )
 from springbench.solvers.methods.vertex_block.vbd import SweepMemory
-from springbench.solvers.methods.vertex_block.vbd_sweeps import ColourPackets, run_iterations, start_sweeps
+from springbench.solvers.methods.vertex_block.vbd_sweeps import run_iterations, start_sweeps
 from springbench.solvers.simd.dot_products import ordered_dot
 
 ROUND_SWEEPS = 5
@@ -38,36 +36,29 @@ NOT_STARTED = -1.0
 
 
 class SweepStep(NamedTuple):
-    """The data of sweeps in a step, and the arrays of a solve.
+    """The data of sweeps, and the arrays of a solve.
 
     Attributes:
-        colour_packets: packets of the free vertices.
         vertex_rows: rows of the vertices.
         spectral_radius: spectral radius of Chebyshev's extrapolation.
-        sweep_memory: positions in rows of four [m], right-hand side by packets [N], and scratch.
-        inertial_target, force: inertial target [m] and external force [N], (n, 3).
-        pin_targets: targets of the pins (q, 3) [m].
+        sweep_memory: packets, positions in rows of four [m], right-hand side by packets [N], and scratch.
     """
 
-    colour_packets: ColourPackets
     vertex_rows: VertexRows
     spectral_radius: float
     sweep_memory: SweepMemory
-    inertial_target: NDArray[np.float64]
-    force: NDArray[np.float64]
-    pin_targets: NDArray[np.float64]
 
 
 @jit_inner
 def _step_window(state):
-    step, window, sweeps, _ = state
+    step, window, sweeps, _, _ = state
     sweeps.sweep_memory.sweep_scratch.omega[0] = NOT_STARTED
     return step_state((step, window))
 
 
 @jit_inner
 def _window_residual(state):
-    step, window, _, _ = state
+    step, window, _, _, _ = state
     return compute_window_residual((step, window))
 
 
@@ -82,21 +73,13 @@ def _sweep_vertices(state):
 
     Sweeps that follow each other continue Chebyshev's extrapolation.
     """
-    step, window, sweeps, out = state
-    rows, right, scratch = sweeps.sweep_memory
+    step, window, sweeps, step_arrays, out = state
+    packets, rows, right, scratch = sweeps.sweep_memory
     if scratch.omega[0] == NOT_STARTED:
         read_positions(step.vertex_rows, window.position, out)
-        start_sweeps(
-            sweeps.vertex_rows,
-            sweeps.inertial_target,
-            sweeps.force,
-            sweeps.pin_targets,
-            out,
-            right,
-            scratch,
-            rows,
-        )
-    run_iterations(sweeps.colour_packets, None, None, right, sweeps.spectral_radius, scratch, rows, ROUND_SWEEPS)
+        target, force, pin_targets = step_arrays
+        start_sweeps(sweeps.vertex_rows, target, force, pin_targets, out, right, scratch, rows)
+    run_iterations(packets, None, None, right, sweeps.spectral_radius, scratch, rows, ROUND_SWEEPS)
     source, destination = sweeps.vertex_rows.row_of_vertex, step.vertex_rows.row_of_vertex
     for v in range(len(source)):
         for c in range(3):
@@ -133,7 +116,13 @@ _iterate_rounds = build_compiled_rounds(_step_window, _window_residual, _window_
 
 @jit_kernel
 def run_sweep_rounds(
-    step: AcceleratedStep, window: AccelerationWindow, sweeps: SweepStep, rounds: Any, limits: Any, out: Any
+    step: AcceleratedStep,
+    window: AccelerationWindow,
+    sweeps: SweepStep,
+    step_arrays: Any,
+    rounds: Any,
+    limits: Any,
+    out: Any,
 ):
     """Run rounds of iterations (`springbench.solvers.kernels.descent_rounds`) and write the positions to `out`.
 
@@ -141,6 +130,7 @@ def run_sweep_rounds(
         step: data of the system; its vectors and objective values are updated.
         window: state of the solve, from `accelerated_step.start_solve`; updated.
         sweeps: data of the sweeps; its arrays of the solve are updated.
+        step_arrays: inertial target [m] and external force [N], (n, 3), and targets of the pins (q, 3) [m].
         rounds: state of the rounds (1,) of type ROUND_STATE_DTYPE, updated.
         limits: limits of the loop, in rounds.
         out: positions (n, 3) [m].
@@ -148,6 +138,6 @@ def run_sweep_rounds(
     Returns:
         Number of rounds, last residual [J^(1/2)] and termination reason.
     """
-    answer = _iterate_rounds((step, window, sweeps, out), rounds, limits)
+    answer = _iterate_rounds((step, window, sweeps, step_arrays, out), rounds, limits)
     read_positions(step.vertex_rows, window.position, out)
     return answer

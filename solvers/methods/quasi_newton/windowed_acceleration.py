@@ -13,7 +13,7 @@ the solve terminates as "stalled" and its iterate stays unchanged.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import numpy as np
 from springbench.solvers.contact.half_space.vertex_contact import without_vertex_contact
@@ -48,7 +48,6 @@ from springbench.solvers.methods.quasi_newton import accelerated_step
 from springbench.solvers.model.barrier_energy import without_barriers
 from springbench.solvers.model.step_problem import Positions, PreparedSolver, ProjectiveEnergy, StepProblem, System
 from springbench.solvers.objective.fixed_objective import FixedObjective
-from springbench.solvers.objective.spring_form import SpringForm
 from springbench.solvers.objective.step_objective import StepObjective
 
 
@@ -210,7 +209,7 @@ class CompiledEngine:
 
     def __init__(self, scheme: AccelerationScheme, compiled: PreparedCompiledLocalGlobal) -> None:
         self._acceleration_scheme = scheme
-        self._spring_form, self._form = compiled.spring_form, compiled.norm_packets
+        self.spring_form, self._form = compiled.spring_form, compiled.norm_packets
         plan, bundles, self._rows = compiled.iteration_plan, compiled.spring_packets, compiled.vertex_rows
         pins = compiled.base.system.pins
         self._block_entries = 4 * int(plan.block_table[:, 1].max())
@@ -218,14 +217,14 @@ class CompiledEngine:
         self._shares = ObjectiveWeights.from_packets(
             bundles, plan.anchor_stiffness, self._rows.row_of_vertex[pins.vertices[pins.exact_mask]]
         )
-        self._free_states: list[_AccelerationMemory] = []
-        self._solve_kernels = _SolveKernels(
+        self.free_memory: list[AccelerationMemory] = []
+        self.start_solve, self.run_solve, self.read_positions = (
             TypedKernel(accelerated_step.start_solve),
             TypedKernel(accelerated_step.run_solve),
             TypedKernel(step_setup.read_positions),
         )
 
-    def _allocate_state(self) -> _AccelerationMemory:
+    def _allocate_memory(self) -> AccelerationMemory:
         whole = 4 * len(self._plan.anchor_stiffness)
         window = allocate_window(self._acceleration_scheme, self._block_entries, whole, self._plan.inverse_blocks.dtype)
         window.trial_position[4 * self._padding_row] = PADDING_COORDINATE
@@ -236,8 +235,9 @@ class CompiledEngine:
             allocate_aligned(whole),
             np.zeros(3),
         )
+        packets = self._spring_packets.with_own_dashpots()
         return accelerated_step.AcceleratedStep(
-            self._plan, self._spring_packets, self._form, self._shares, self._rows, *vectors
+            self._plan, packets, self._form, self._shares, self._rows, *vectors
         ), window
 
     def init_state(self, problem: StepProblem, initial_guess: Positions) -> AcceleratedState:
@@ -263,78 +263,56 @@ class CompiledEngine:
         return self._init_state(problem, initial_guess, start)
 
     def _init_state(self, problem: StepProblem, guess: Positions, start: int) -> CompiledAccelerationState:
-        return CompiledAccelerationState(
-            self._free_states, self._take_memory(), self._solve_kernels, self._spring_form, problem, guess, start
-        )
+        return CompiledAccelerationState(self, problem, guess, start)
 
-    def _take_memory(self) -> _AccelerationMemory:
+    def take_memory(self) -> AccelerationMemory:
         """Return the work arrays of a solve that has ended, or allocate them."""
-        return self._free_states.pop() if self._free_states else self._allocate_state()
+        return self.free_memory.pop() if self.free_memory else self._allocate_memory()
 
 
-_AccelerationMemory = tuple[accelerated_step.AcceleratedStep, AccelerationWindow]
-"""Work arrays of a solve."""
-
-
-class _SolveKernels(NamedTuple):
-    """Compiled kernels of a solve, from `springbench.solvers.methods.quasi_newton.accelerated_step`."""
-
-    start_solve: TypedKernel
-    run_solve: TypedKernel
-    read_positions: TypedKernel
+AccelerationMemory = tuple[accelerated_step.AcceleratedStep, AccelerationWindow, *tuple[Any, ...]]
+"""Work arrays of a solve; an engine may add others."""
 
 
 class CompiledAccelerationState(AcceleratedState):
-    """State of a compiled solve; `free_states` receives its work arrays when it is deleted.
+    """State of a compiled solve; its work arrays return to the engine when it is deleted.
 
     Attributes:
         guess_residual: residual at the initial guess [J^(1/2)], NaN if it is not measured.
     """
 
-    def __init__(
-        self,
-        free_states: list[_AccelerationMemory],
-        state: _AccelerationMemory,
-        solve_kernels: _SolveKernels,
-        parts: SpringForm,
-        problem: StepProblem,
-        guess: Positions,
-        start: int,
-    ) -> None:
+    def __init__(self, engine: CompiledEngine, problem: StepProblem, guess: Positions, start: int) -> None:
         """Start a solve.
 
         Args:
-            free_states: list that receives the work arrays.
-            state: work arrays.
-            solve_kernels: kernels of a solve.
-            parts: decomposition of the system's energies.
+            engine: iteration of the system.
             problem: step whose objective is minimised.
             guess: initial guess (n, 3) [m].
             start: START_AT_GUESS, START_LOWER or START_LOWER_MEASURED.
         """
-        self._free_states, self._memory, self._solve_kernels = free_states, state, solve_kernels
-        step, window = state
-        if parts.has_edges:
-            step = step._replace(spring_packets=parts.update_edges(step.spring_packets, problem))
+        self._engine, self._memory, parts = engine, engine.take_memory(), engine.spring_form
+        step, window = self._memory[:2]
+        if (packets := parts.update_edges(step.spring_packets, problem)) is not step.spring_packets:
+            step = step._replace(spring_packets=packets)
         self._state = step, window
         target, external, pins, at = map(
             as_kernel_array, (problem.inertial_target, problem.external_force, problem.pin_targets, guess)
         )
         force = parts.compute_force(problem) if parts.form_builders else external
-        self._problem, self._step_arrays = problem, (target, force, pins)
+        self._step_arrays = target, force, pins
         self.positions = np.empty(guess.shape)
-        self.guess_residual, self.start_residual = solve_kernels.start_solve.call(
+        self.guess_residual, self.start_residual = engine.start_solve.call(
             step, window, target, force, pins, at, external, start, self.positions
         )
         if parts.form_builders or parts.has_edges:
-            p = guess if start == accelerated_step.START_AT_GUESS else self.positions
+            p = at if start == accelerated_step.START_AT_GUESS else self.positions
             step.objective_values[2] = parts.negative_energy(p)
             if parts.has_edges:
                 step.objective_values[1] += parts.edge_energy_scale(p)
 
     def run_iterations(self, limits: LoopLimits) -> tuple[int, float, int]:
         """Run iterations within the limits; return count, residual and reason."""
-        return self._solve_kernels.run_solve.call(*self._state, limits, self.positions)
+        return self._engine.run_solve.call(*self._state, limits, self.positions)
 
     def step_state(self) -> bool:
         """Do one iteration; return False if round-off prevents any further change."""
@@ -353,11 +331,11 @@ class CompiledAccelerationState(AcceleratedState):
         """Return the gradient of the objective (n, 3) [N] at the current point."""
         step, window = self._state
         out = np.empty_like(self.positions)
-        self._solve_kernels.read_positions.call(step.vertex_rows, window.descent, out)
+        self._engine.read_positions.call(step.vertex_rows, window.descent, out)
         return np.negative(out, out=out)
 
     def __del__(self) -> None:
-        self._free_states.append(self._memory)
+        self._engine.free_memory.append(self._memory)
 
 
 class _InterpretedEngine:

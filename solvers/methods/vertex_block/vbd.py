@@ -246,23 +246,31 @@ class PreparedVertexBlockDescent(IterativeSolver):
 
     def take_memory(self) -> SweepMemory:
         """Return the work arrays of a solve that has ended, or allocate them."""
-        return self.free_memory.pop() if self.free_memory else self._allocate_memory()
+        return self.free_memory.pop() if self.free_memory else self.allocate_memory()
 
-    def update_packets(self, problem: StepProblem) -> kernels.ColourPackets:
-        """Return the packets of the vertices, with the edges of a step."""
-        form, blocks = self.spring_form, self.colour_packets
-        if not form.has_edges:
-            return blocks
-        return blocks._replace(spring_packets=form.update_edges(blocks.spring_packets, problem))
+    def update_packets(self, memory: SweepMemory, problem: StepProblem) -> SweepMemory:
+        """Return the work arrays of a solve with the edges of a step.
 
-    def _allocate_memory(self) -> SweepMemory:
-        packets, size = self.colour_packets.spring_packets, len(self.anchor_stiffness)
+        Args:
+            memory: work arrays; dashpots in their packets are overwritten.
+            problem: the step.
+        """
+        blocks = memory.colour_packets
+        packets = self.spring_form.update_edges(blocks.spring_packets, problem)
+        if packets is blocks.spring_packets:
+            return memory
+        return memory._replace(colour_packets=blocks._replace(spring_packets=packets))
+
+    def allocate_memory(self) -> SweepMemory:
+        """Allocate the work arrays of a solve."""
+        packets, size = self.colour_packets.spring_packets.with_own_dashpots(), len(self.anchor_stiffness)
         entries = int(np.diff(packets.packet_start).max(initial=0))
         p, previous, older, descent = (allocate_aligned(4 * size) for _ in range(4))
         springs = allocate_aligned((PACKET_SCRATCH_SIZE + SPRING_SCRATCH_SIZE * entries) * LANES)
         sums = allocate_aligned(9 * LANES)
         scratch = kernels.SweepScratch(previous, older, descent, springs, sums, np.zeros(1), np.zeros(1))
-        return SweepMemory(p, packets.build_right_hand_side(self.anchor_stiffness), scratch)
+        blocks = self.colour_packets._replace(spring_packets=packets)
+        return SweepMemory(blocks, p, packets.build_right_hand_side(self.anchor_stiffness), scratch)
 
     @cached_property
     def vertex_rows(self) -> step_setup.VertexRows:
@@ -315,8 +323,9 @@ class PreparedVertexBlockDescent(IterativeSolver):
 
 
 class SweepMemory(NamedTuple):
-    """Work arrays of a solve: positions in rows, right-hand side and scratch memory."""
+    """Packets and work arrays of a solve: positions in rows, right-hand side and scratch memory."""
 
+    colour_packets: kernels.ColourPackets
     rows: NDArray[np.float64]
     right_hand_side: NDArray[np.float64]
     sweep_scratch: kernels.SweepScratch
@@ -338,10 +347,12 @@ class SweepState(SolverState):
         self._memory = memory = prepared.take_memory()
         contacts = begin_active_contacts(problem)
         self._element_data = prepared.vertex_elements.update_elements(problem)
-        self._colour_packets, self._problem = prepared.update_packets(problem), problem
+        self._problem = problem
         self._compute_residual: Callable[[Positions], float] | None = None
         self._half_spaces = prepared.build_half_spaces(contacts) if contacts else None
-        self._rows, self._right_hand_side, self._sweep_scratch = memory
+        self._colour_packets, self._rows, self._right_hand_side, self._sweep_scratch = prepared.update_packets(
+            memory, problem
+        )
         given = problem.inertial_target, prepared.spring_form.compute_force(problem), problem.pin_targets, guess
         prepared.sweep_kernels.start_sweeps.call(
             prepared.vertex_rows, *map(as_kernel_array, given), self._right_hand_side, self._sweep_scratch, self._rows

@@ -91,8 +91,10 @@ class Dashpots(EdgeEnergy):
 
     def begin_step(self, start: StepStart) -> Dashpots:
         """Return the energy of a step."""
-        _, n = unit_directions(self._edge_vectors(start.lagged_positions), self.direction)
-        offset = _row_dots(n, self._edge_vectors(start.velocity_origin))
+        lagged = start.lagged_positions
+        v = self._edge_vectors(lagged)
+        _, n = unit_directions(v, self.direction)
+        offset = _row_dots(n, v if start.velocity_origin is lagged else self._edge_vectors(start.velocity_origin))
         return replace(self, stiffness=start.velocity_rate * self.stiffness, direction=n, offset=offset)
 
     def _closing_length(self, p: Positions) -> NDArray[np.float64]:
