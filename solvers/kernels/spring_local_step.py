@@ -145,23 +145,17 @@ class SpringPackets(NamedTuple):
         out[:] = values[self.row_offset // 4]
         return out
 
-    def build_right_hand_side(
-        self, anchor_stiffness: NDArray[np.float64], y: NDArray[np.float64] | None = None
-    ) -> NDArray[np.float64]:
-        """Build the constant right-hand side y of the packets, with anchor stiffnesses.
+    def build_right_hand_side(self, anchor_stiffness: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Build a right-hand side of zeros in the layout of the packets, with anchor stiffnesses.
 
         A packet has RHS_STRIDE numbers: eight x, y and z each, and eight stiffnesses. Rows that are in no packet share
         one more packet at the end.
 
         Args:
             anchor_stiffness: anchor stiffness of each row [N/m].
-            y: in rows of four; zero, to be overwritten, if it is not given.
         """
         out = allocate_aligned(4 * len(self.row_offset) + RHS_STRIDE)
-        bundles = out[:-RHS_STRIDE].reshape(-1, 4, LANES)
-        bundles[:, 3] = self.gather_lanes(anchor_stiffness).reshape(-1, LANES)
-        if y is not None:
-            bundles[:, :3] = y.reshape(-1, 4)[self.row_offset // 4, :3].reshape(-1, LANES, 3).transpose(0, 2, 1)
+        out[:-RHS_STRIDE].reshape(-1, 4, LANES)[:, 3] = self.gather_lanes(anchor_stiffness).reshape(-1, LANES)
         return out
 
     def right_hand_side_offset(self, rows: int) -> NDArray[np.int64]:

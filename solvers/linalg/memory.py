@@ -20,7 +20,7 @@ def allocate_aligned(size: int, dtype: Any = np.float64) -> NDArray[Any]:
     """
     bytes_ = np.dtype(dtype).itemsize * size
     raw = np.zeros(bytes_ + 64, np.uint8)
-    begin = -raw.ctypes.data % 64
+    begin = -raw.__array_interface__["data"][0] % 64  # `raw.ctypes` takes twice the time
     return raw[begin : begin + bytes_].view(dtype)
 
 

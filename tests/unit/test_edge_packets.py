@@ -115,7 +115,7 @@ def evaluate(network: Network, p: NDArray[np.float64], packets: SpringPackets | 
     x.reshape(-1, 4)[:NUM_VERTICES, :3] = p
     x[-4] = 1e100
     anchor = np.full(rows, ANCHOR_STIFFNESS)
-    right, many = packets.build_right_hand_side(anchor, np.zeros(4 * rows)), len(packets.packet_start) - 1
+    right, many = packets.build_right_hand_side(anchor), len(packets.packet_start) - 1
     near = allocate_aligned(
         (PACKET_SCRATCH_SIZE + SPRING_SCRATCH_SIZE * int(np.diff(packets.packet_start).max())) * LANES
     )

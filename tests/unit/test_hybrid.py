@@ -182,7 +182,8 @@ def test_sweeps_help_lbfgs_where_springs_are_compressed(monkeypatch):
     for max_ratio in (hybrid_newton._MAX_SWEEP_RATIO, 0.0):
         monkeypatch.setattr(hybrid_newton, "_MAX_SWEEP_RATIO", max_ratio)
         prepared, start = HybridNewton().prepare(given.system), given.value(given.initial_guess)
-        run = prepared.init_state(given, given.initial_guess)
+        assert isinstance(prepared, PreparedHybrid)
+        run: Any = prepared.init_state(given, given.initial_guess)
         while given.value(run.positions) - given.value(lowest) > 1e-6 * (start - given.value(lowest)):
             run.step_state()
         counts.append(int(run._rounds["num_iterations"][0]))

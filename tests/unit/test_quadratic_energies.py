@@ -121,7 +121,7 @@ def test_a_negative_energy_of_a_packet_is_no_short_spring():
     pair = Springs(np.array([[0, 1]]), np.array([-2.0]), np.zeros(1), np.eye(3)[:1])
     packets, _ = SpringPackets.from_springs(pair, np.arange(2), np.zeros(2, np.int64), 1, 2, 3)
     weights = ObjectiveWeights.from_packets(packets, np.zeros(4), np.empty(0, np.int64))
-    x, right = allocate_aligned(16), packets.build_right_hand_side(np.zeros(4), np.zeros(16))
+    x, right = allocate_aligned(16), packets.build_right_hand_side(np.zeros(4))
     x[:8], x[12] = [3.0, 0.0, 0.0, 0.0, 0.0, 4.0, 0.0, 0.0], 1e100
     value = np.empty(1)
 

@@ -59,7 +59,7 @@ class LbfgsSweepState(CompiledAccelerationState):
             start: START_AT_GUESS, START_LOWER or START_LOWER_MEASURED.
         """
         super().__init__(engine, problem, guess, start)
-        sweeps: SweepStep = self._memory[2]
+        _, _, sweeps = self._memory
         sweeps.sweep_memory.sweep_scratch.omega[0] = NOT_STARTED
         if (memory := engine.sweeps.update_packets(sweeps.sweep_memory, problem)) is not sweeps.sweep_memory:
             sweeps = sweeps._replace(sweep_memory=memory)

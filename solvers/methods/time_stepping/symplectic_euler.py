@@ -38,6 +38,7 @@ from springbench.solvers.model.step_problem import (
     StepProblem,
     System,
 )
+from springbench.solvers.simd.spring_packets import LANES
 
 _MAX_SPRING_EVALUATIONS = 1e10
 """Maximum number of spring evaluations in a step, tens of seconds: the plainest loop of all explicit methods shows what
@@ -141,14 +142,21 @@ class PreparedSymplecticEuler(IterativeSolver):
         s, h = self.system, self.system.time_step / self.num_substeps
         return np.divide(h, s.mass, out=np.zeros(s.num_vertices), where=s.unpinned_mask)
 
+    @cached_property
+    def _packed_force(self) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """Memory for the external force [N] in the layout of the packets, and its places there (n, 3)."""
+        n, packets = self.system.num_vertices, self.spring_packets
+        places = packets.right_hand_side_offset(n + 2)[:n, None] + LANES * np.arange(3)
+        return packets.build_right_hand_side(np.zeros(n + 2)), places
+
     def _integrate_step(self, problem: StepProblem) -> tuple[Positions, Positions]:
         s, pins, start = self.system, self.system.pins.vertices, problem.step_start
         h = s.time_step / self.num_substeps
         begin, end = start.positions[pins], problem.pin_targets.copy()
         p = pad_rows(start.positions, pad_far=True)
-        v, force = pad_rows(start.velocity), pad_rows(problem.external_force)
+        v, (force, places) = pad_rows(start.velocity), self._packed_force
         v.reshape(-1, 4)[pins] = 0.0
-        force = self.spring_packets.build_right_hand_side(np.zeros(s.num_vertices + 2), force)
+        force[places] = problem.external_force
         pinned = self._pinned_vertices, begin, end
         self._run_steps.call(
             self.spring_packets, *pinned, force, self._velocity_rate, h, self.num_substeps, p, v, np.zeros_like(v)
