@@ -131,7 +131,7 @@ class SpringPackets(NamedTuple):
         ), first
 
     def with_own_dashpots(self) -> SpringPackets:
-        """Return the packets with arrays of their own for the dashpots of a step, if there are edges."""
+        """Return the packets with arrays of their own for the dashpots of a step."""
         return self if self.edges is None else self._replace(edges=self.edges.with_own_dashpots())
 
     def entry_weights(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -275,7 +275,7 @@ AccelerationMemory = tuple[accelerated_step.AcceleratedStep, AccelerationWindow,
 
 
 class CompiledAccelerationState(AcceleratedState):
-    """State of a compiled solve; its work arrays return to the engine when it is deleted.
+    """State of a compiled solve, whose work arrays return to the engine.
 
     Attributes:
         guess_residual: residual at the initial guess [J^(1/2)], NaN if it is not measured.
