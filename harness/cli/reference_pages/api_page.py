@@ -67,7 +67,7 @@ def _describe_name(name: str, value: Any, module: str) -> str:
 
 def _describe_members(kind: type) -> list[str]:
     parts: list[str] = []
-    for name, member in vars(kind).items():
+    for name, member in list(vars(kind).items()):  # a model of pydantic may be completed by an access
         function = member.fget if isinstance(member, property) else getattr(member, "__func__", member)
         if name.startswith("_") or not inspect.isfunction(function) or not function.__doc__:
             continue
