@@ -162,7 +162,7 @@ def _is_cycle_at_largest(earlier: deque[_Round], x: Positions, acting: float) ->
 
 
 def _has_no_normal_forces(problem: StepProblem, x: Positions) -> bool:
-    """Return whether friction vanishes, with the normal forces of the step and with those at x.
+    """Return whether friction vanishes for the normal forces of the step and at x.
 
     Energies of contact are not negative, so their forces vanish where they are zero.
     """

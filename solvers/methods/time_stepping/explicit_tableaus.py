@@ -48,7 +48,7 @@ class SplittingMethod:
         return len(self.kicks) - (self.drifts[0] == 0.0)
 
     def compute_growth(self, y: FloatArray) -> FloatArray:
-        """Return the largest magnitude of an eigenvalue of a step for oscillators with omega h = y (k,)."""
+        """Return the spectral radius of a step for oscillators with omega h = y (k,)."""
         step = np.broadcast_to(np.eye(2), (len(y), 2, 2))
         drift, kick = np.zeros((2, *step.shape)) + np.eye(2)
         for k, length in enumerate(self.drifts):
