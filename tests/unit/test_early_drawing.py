@@ -85,11 +85,20 @@ def test_the_process_that_draws_starts_where_the_command_draws(
     assert len(begun) == starts
 
 
+@pytest.fixture
+def can_fork(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Forget what other tests of this process have started."""
+    monkeypatch.setattr(isolated_worker, "FORK_BLOCKERS", set[str]())
+    monkeypatch.setattr(isolated_worker, "_has_numba_threads", lambda: False)
+
+
+@pytest.mark.usefixtures("can_fork")
 def test_a_fork_returns_the_value_of_its_call() -> None:
     wait = start_in_fork(os.getpid)
     assert wait() != os.getpid()
 
 
+@pytest.mark.usefixtures("can_fork")
 def test_a_call_that_fails_in_a_fork_raises_its_error_here() -> None:
     def fail() -> None:
         raise InputError("a folder is missing")
