@@ -189,9 +189,10 @@ def run(
 
 def _preload_reports() -> None:
     """Import the modules of `_report_sweep`, which takes as long as drawing a picture."""
+    from springbench.harness.execution.progress_events import ignore_progress
     from springbench.harness.execution.timing_lock import lock_timing_shared
 
-    with lock_timing_shared(lambda message: None):
+    with lock_timing_shared(ignore_progress):
         import_module("springbench.harness.report.sweep_summary")
         import_module("springbench.harness.report.site.sweep_overview")
 

@@ -12,6 +12,7 @@ from typing import Any
 
 from springbench.harness.errors import RunFailed
 from springbench.harness.execution.isolated_worker import IsolatedWorker, TaskFailure
+from springbench.harness.execution.progress_events import ignore_progress
 from springbench.harness.execution.worker_process import ProgressCallback, TaskFunction, TaskLimits
 from springbench.solvers.platform_calls import can_isolate_processes
 
@@ -69,8 +70,4 @@ def run_in_early_worker(task: TaskFunction, tick: ProgressCallback) -> Any:
 
 def wait_for_early_worker() -> None:
     """Wait until the early worker has imported its libraries, which would disturb timings."""
-    run_in_early_worker(_do_nothing, _do_nothing)
-
-
-def _do_nothing(argument: object) -> None:
-    pass
+    run_in_early_worker(ignore_progress, ignore_progress)

@@ -72,3 +72,7 @@ def report_compilation(tick: ProgressCallback) -> Generator[None]:
 
     with event.install_listener("numba:compile", Watch()):
         yield
+
+
+def ignore_progress(event: object) -> None:
+    """Do nothing; a progress callback, and a task that ends at once."""

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from springbench.harness.console import show_activity
 from springbench.harness.execution.isolated_worker import ProgressCallback, TaskLimits
 from springbench.harness.execution.progress_display import ThrottledMessages
+from springbench.harness.execution.progress_events import ignore_progress
 from springbench.harness.execution.timing_lock import lock_timing_shared
 from springbench.harness.execution.worker_pool import PoolTask, run_tasks
 from springbench.solvers.platform_calls import can_isolate_processes, list_usable_cores
@@ -83,7 +84,7 @@ def compile_missing_kernels(callers: Iterable[str], print_message: Callable[[str
     missing = [signature for signature in table.select_kernels(known) if is_missing(signature)]
 
     def create_task(number: int) -> PoolTask:
-        return PoolTask(partial(_compile_kernel, missing[number]), _ignore_progress, TaskLimits())
+        return PoolTask(partial(_compile_kernel, missing[number]), ignore_progress, TaskLimits())
 
     print_message(f"compiling {len(missing)} kernels on {num_processes} cores (once)")
     report = ThrottledMessages(print_message, show_activity)
@@ -94,10 +95,6 @@ def compile_missing_kernels(callers: Iterable[str], print_message: Callable[[str
 def list_kernels(caller: str) -> list[KernelSignature]:
     """Return the kernels that a solver, or ERROR_CONTROL, calls."""
     return _SignatureTable.from_file().select_kernels([caller])
-
-
-def _ignore_progress(event: object) -> None:
-    pass
 
 
 def _compile_kernel(signature: KernelSignature, tick: ProgressCallback) -> None:

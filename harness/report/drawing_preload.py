@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from importlib import import_module
 
+from springbench.harness.execution.progress_events import ignore_progress
 from springbench.harness.execution.timing_lock import lock_timing_shared
 from springbench.harness.report import opengl_probe
 
@@ -21,7 +22,7 @@ _SCENE_MODULES = (
 
 def preload_drawing() -> None:
     """Import what draws the pictures of a sweep, no module while a run is timed."""
-    with lock_timing_shared(_ignore_progress):
+    with lock_timing_shared(ignore_progress):
         opengl_probe.start_opengl_probe()
         import_module("matplotlib.figure")
         problem = opengl_probe.find_opengl_problem()
@@ -38,9 +39,5 @@ def preload_preview() -> None:
 
 def _import_untimed(modules: tuple[str, ...]) -> None:
     for module in modules:
-        with lock_timing_shared(_ignore_progress):
+        with lock_timing_shared(ignore_progress):
             import_module(module)
-
-
-def _ignore_progress(message: str) -> None:
-    pass

@@ -14,6 +14,7 @@ import pyarrow as pa
 from springbench.harness.config.sweep_config import REPORT_TABLE
 from springbench.harness.errors import RunFailed, SpringbenchError
 from springbench.harness.execution.isolated_worker import IsolatedWorker, TaskFailure
+from springbench.harness.execution.progress_events import ignore_progress
 from springbench.harness.execution.worker_process import ProgressCallback, TaskLimits
 from springbench.solvers.plugins.plugin_discovery import PluginName, load_target
 
@@ -77,7 +78,7 @@ def _run_in_worker(name: PluginName, table: pa.Table, folder: Path, seconds: flo
     worker = IsolatedWorker()
     try:
         limits = TaskLimits(min(_TIME_LIMIT, seconds or _TIME_LIMIT), _MEMORY_LIMIT, folder / "logs" / "reports.txt")
-        return worker.run_task(partial(_run_plugin_report, name, table, folder.absolute()), _ignore_progress, limits)
+        return worker.run_task(partial(_run_plugin_report, name, table, folder.absolute()), ignore_progress, limits)
     except (TaskFailure, SpringbenchError) as error:
         raise RunFailed(f"the report {name} failed: {error}") from None
     finally:
@@ -91,7 +92,3 @@ def _run_plugin_report(name: PluginName, table: pa.Table, folder: Path, tick: Pr
     if not all(isinstance(path, Path | str) for path in paths):
         raise RunFailed(f"it returned a {type(wrote).__name__}; expected a list of the files that it wrote")
     return [Path(str(path)) for path in paths]
-
-
-def _ignore_progress(message: str) -> None:
-    pass

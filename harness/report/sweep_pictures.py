@@ -19,6 +19,7 @@ from springbench.harness.config.sweep_config import RunSpec
 from springbench.harness.execution.isolated_worker import ProgressCallback, TaskFailure, TaskLimits
 from springbench.harness.execution.optional_parts import PICTURES
 from springbench.harness.execution.progress_display import ThrottledMessages
+from springbench.harness.execution.progress_events import ignore_progress
 from springbench.harness.execution.timing_lock import lock_timing_shared
 from springbench.harness.execution.worker_pool import PoolTask, run_tasks
 from springbench.harness.execution.worker_process import TaskFunction
@@ -70,7 +71,7 @@ def draw_sweep_pictures(
         if any(p.run.pictures for p in jobs) and sources != read_sources(path):
             from springbench.harness.report.timing_plot import draw_timing_plot
 
-            with lock_timing_shared(_ignore_progress):
+            with lock_timing_shared(ignore_progress):
                 draw_timing_plot(table, path, name, stale_ids, sources)
 
     missing = _load_drawing() if wanting or any(group.has_outdated_picture for group in groups) else None
@@ -154,10 +155,6 @@ def _draw_job(p: PictureJob, tick: ProgressCallback) -> None:
         draw_run_picture(
             read_replay(p.recording_path), p.picture_path, camera=(camera.azimuth, camera.elevation) if camera else None
         )
-
-
-def _ignore_progress(message: str) -> None:
-    pass
 
 
 @dataclass(frozen=True, slots=True)

@@ -362,8 +362,8 @@ class ObstacleContact(BarrierContact):
     def begin_step(self, start: StepStart) -> Self:
         """Return the energy of a step, with obstacles at their end positions."""
         begun, end = self.obstacle_positions_at(start.time), self.obstacle_positions_at(start.stage_time)
-        step = self
-        if not begun is end is self.current_positions:
+        step, is_at_rest = self, begun is end and end is self.current_positions
+        if not is_at_rest:
             step = replace(
                 self,
                 start_positions=begun,

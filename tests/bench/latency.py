@@ -153,7 +153,7 @@ LATENCY_ROWS = {
         1.5,
         (*_TO_ERROR, "--rerun"),
         (_TO_ERROR,),
-        limit="three quarters import Numba, SciPy, Pydantic and Typer; a seventh loads compiled kernels",
+        limit="one half imports Numba, SciPy, Pydantic and Typer; a third prepares and tries ten methods",
     ),
     "recommend-chain": LatencyRow(
         "recommend, chain", 12.0, ("recommend", "chain", "--error", "1e-2", "--results", "RESULTS"), cold="results"
@@ -170,7 +170,7 @@ LATENCY_ROWS = {
         0.2,
         (*_IN_PROCESS, "search-alone"),
         value_key="seconds",
-        limit="one half integrates ten methods once, the other estimates how perturbations grow",
+        limit="four fifths prepare and try ten methods; the rest integrates the reference",
     ),
     "chain-motion": LatencyRow(
         "chain of 9, 0.5 s to 1e-4, the chosen motion",

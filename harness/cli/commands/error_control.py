@@ -19,6 +19,7 @@ from springbench.harness.execution import machine_info
 from springbench.harness.execution.early_worker import run_in_early_worker, wait_for_early_worker
 from springbench.harness.execution.isolated_call import run_isolated
 from springbench.harness.execution.optional_parts import RECORDINGS
+from springbench.harness.execution.progress_events import ignore_progress
 from springbench.harness.execution.worker_process import TaskLimits
 from springbench.harness.experiments.accuracy.accuracy_schema import ACCURACY_SCHEMA
 from springbench.harness.experiments.error_control.candidate_methods import (
@@ -139,7 +140,7 @@ def _execute_error_control(
                 error_target, error, results, print_message, print_message, list_contact_methods()
             )
         else:
-            if not scene.find_plugins():  # whose process starts no others
+            if not scene.find_plugins():  # the process that isolates user code starts no others
                 compile_missing_kernels([ERROR_CONTROL], print_message)
             seen = compute_predictability_horizon(error_target, error, print_message)
             answer = _search_method(error_target, error, seen, [] if request.rerun else before, print_message)
@@ -383,7 +384,7 @@ def _record_motion(
         },
     )
     task = partial(_write_recording, path, info, best.trajectory.positions)
-    return run_in_early_worker(task, lambda message: None)
+    return run_in_early_worker(task, ignore_progress)
 
 
 def _write_recording(path: Path, info: RecordingInfo, positions: Positions, tick: PrintMessage) -> Path:

@@ -34,11 +34,12 @@ def preview(
     from springbench.harness.config.config_loader import load_scene_run
     from springbench.harness.config.user_code import DEFAULT_LOAD_LIMITS
     from springbench.harness.execution.early_worker import run_in_early_worker
+    from springbench.harness.execution.progress_events import ignore_progress
     from springbench.harness.execution.worker_process import TaskLimits
 
     run = load_scene_run(scene, size)
     content = run_isolated(partial(_describe_scene, run), run.find_plugins(), TaskLimits(*DEFAULT_LOAD_LIMITS))
-    run_in_early_worker(partial(_draw_preview, content, path), lambda message: None)
+    run_in_early_worker(partial(_draw_preview, content, path), ignore_progress)
     for line in (*content.lines, f"the picture is {path}"):
         print_message(line)
 

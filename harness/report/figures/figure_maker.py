@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from springbench.harness.errors import InputError, InputMistake
 from springbench.harness.execution.early_worker import run_in_early_worker
+from springbench.harness.execution.progress_events import ignore_progress
 from springbench.harness.report.charts.figure_panels import FigurePanel, MeshPicture
 from springbench.harness.report.figures import panel_selection
 from springbench.harness.report.figures.figure_kinds import FIGURE_KINDS, FigureKind, StaleFinder
@@ -67,7 +68,7 @@ def make_figure(
     stem = folder / "-".join(dict.fromkeys([name, *parts]))
     draw = partial(_draw_figure, panels, stem, kind.title, options)
     is_plain = name in FIGURE_KINDS and not any(isinstance(panel, MeshPicture) for panel in panels)
-    paths, size_mm = run_in_early_worker(draw, _ignore_progress) if is_plain else draw(_ignore_progress)
+    paths, size_mm = run_in_early_worker(draw, ignore_progress) if is_plain else draw(ignore_progress)
     rest = [one for one in entries if one not in picked]
     example = ":".join(rest[0].name_parts) if rest else ""
     shown = [":".join(one.name_parts) for one in picked]
@@ -80,7 +81,3 @@ def _draw_figure(
     from springbench.harness.report.figures.figure_drawing import draw_figure  # with Matplotlib
 
     return draw_figure(panels, stem, title, options)
-
-
-def _ignore_progress(message: str) -> None:
-    pass
