@@ -12,6 +12,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+from pydantic import BaseModel
 from springbench.harness.cli.reference_pages.markdown_text import format_docstring
 
 _INTRODUCTION = """# Python API
@@ -56,6 +57,8 @@ def build_api_page() -> str:
 
 def _describe_name(name: str, value: Any, module: str) -> str:
     parts = [f"### {name}"]
+    if inspect.isclass(value) and issubclass(value, BaseModel):
+        value.model_rebuild()  # only a complete model has its own signature
     if inspect.isclass(value) or inspect.isfunction(value):
         parts += [_format_signature(name, value), format_docstring(value.__doc__)]
         if inspect.isclass(value):
@@ -67,7 +70,7 @@ def _describe_name(name: str, value: Any, module: str) -> str:
 
 def _describe_members(kind: type) -> list[str]:
     parts: list[str] = []
-    for name, member in list(vars(kind).items()):  # a model of pydantic may be completed by an access
+    for name, member in vars(kind).items():
         function = member.fget if isinstance(member, property) else getattr(member, "__func__", member)
         if name.startswith("_") or not inspect.isfunction(function) or not function.__doc__:
             continue
