@@ -12,7 +12,7 @@ import signal
 from collections.abc import Callable
 from contextlib import suppress
 from enum import Enum
-from math import inf
+from math import ceil, inf
 
 try:
     import fcntl
@@ -154,13 +154,13 @@ def set_soft_limit(name: str, value: float) -> None:
 
     Args:
         name: name of the resource, such as `RLIMIT_DATA`.
-        value: limit in the unit of the resource, or infinity.
+        value: limit in the unit of the resource, rounded up to whole units, or infinity.
     """
     if resource is None or not can_isolate_processes():
         return
     number = getattr(resource, name)
     hard = resource.getrlimit(number)[1]
-    soft = hard if value == inf else int(value)
+    soft = hard if value == inf else ceil(value)  # a limit of 0 s would end the process at the next clock tick
     resource.setrlimit(number, (soft if hard == resource.RLIM_INFINITY else min(soft, hard), hard))
 
 
