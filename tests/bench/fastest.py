@@ -2,13 +2,18 @@
 
     ratio = median(t) / min_m median(t_m)     medians over the rounds, minimum over the other methods m
 
-    python -m tests.bench.fastest [CONFIG] [--solver hybrid] [--only WORDS] [--rounds 15] [--measure error]
+    python -m tests.bench.fastest [CONFIG] [--solver hybrid] [--only WORDS] [--rounds 15] [--measure error | own-gap]
 
 The steps, the initial guesses and the methods are those of an accuracy config. An accuracy is an upper bound of one of
 two measures, where g is the objective:
 
     gap      (g - g*)/(g0 - g*), relative to the lowest known minimum
     error    largest distance of a vertex from its position in that minimum, over the same distance at the step's start
+    own-gap  gap relative to the certified minimum to which the method itself converges
+
+Where a step has several minima, which one a method reaches is chance; `own-gap` then measures how fast it converges to
+its own, and `excess` how much higher that is than the lowest known, as a gap. A method that converges to a point that
+is no certified minimum reaches no accuracy.
 
 A method reaches an accuracy with its first iterate that satisfies it. A first pass evaluates all iterates. The methods
 that may be the fastest are then timed interleaved in one process, for several rounds, by the processor time of the
@@ -23,7 +28,7 @@ from __future__ import annotations
 import argparse
 import gc
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from itertools import islice
 from pathlib import Path
 from time import thread_time
@@ -37,19 +42,22 @@ from springbench.harness.execution.machine_info import limit_threads
 from springbench.harness.experiments.accuracy.accuracy_units import open_reference_store
 from springbench.harness.experiments.accuracy.snapshot_rows import SnapshotEvaluation
 from springbench.harness.experiments.accuracy.step_scales import compute_vertex_distances
-from springbench.solvers.model.step_problem import Positions, PreparedSolver, StepProblem, Unsupported
+from springbench.harness.reference.certified_minimum import certify_minimum
+from springbench.solvers.model.step_problem import Positions, PreparedSolver, StepProblem, StopRule, Unsupported
 from springbench.solvers.registry import SOLVER_TABLE, load_target
 
 from tests.bench.scripted_study import describe_provenance, publish_rows
 
 ROOT = Path(__file__).resolve().parents[2]
-TARGETS = {"gap": (1e-3, 1e-4, 1e-6), "error": (1e-3, 1e-6)}
+TARGETS = {"gap": (1e-3, 1e-4, 1e-6), "error": (1e-3, 1e-6), "own-gap": (1e-3, 1e-4, 1e-6)}
 LIMITS = (1.25, 1.6)
 """Ratios for which the number of accuracies within them is printed."""
 MIN_COUNTED_SECONDS = 2e-4
 """Time of the fastest method [s], above which an accuracy is included in these numbers."""
 MAX_FIRST_PASS_RATIO = 3.0
 """A method is timed if its first-pass time is within this multiple of the least, for at least one accuracy."""
+CONVERGED = StopRule(3000, rtol=1e-9)
+"""End of the solve that finds the minimum to which a method converges."""
 NUM_RESAMPLES, CONFIDENCE = 2000, 0.95
 
 
@@ -57,18 +65,29 @@ class CandidateSolve(NamedTuple):
     """A method that is prepared for a step, and its first pass.
 
     name: of the solver; num_iterations, seconds: needed to reach each accuracy, by accuracy; without those that the
-    method does not reach.
+    method does not reach; own_minimum: objective of its own minimum [J], NaN unless it is measured and certified.
     """
 
     name: str
     prepared: PreparedSolver
     num_iterations: dict[float, int]
     seconds: dict[float, float]
+    own_minimum: float = np.nan
 
 
 @dataclass(frozen=True, slots=True)
 class TimeRatio:
-    """Result for one accuracy of a step: the fastest method, its time [s], the ratio, and the ratio's interval."""
+    """Result for one accuracy of a step.
+
+    Attributes:
+        step: title of the step.
+        target: accuracy.
+        fastest: the fastest other method.
+        seconds: its time [s].
+        ratio, low, high: ratio and the ends of its interval.
+        excess: height of the method's minimum above the lowest known, relative to the decrease in the step; NaN if it
+            is not measured.
+    """
 
     step: str
     target: float
@@ -77,6 +96,7 @@ class TimeRatio:
     ratio: float
     low: float
     high: float
+    excess: float = np.nan
 
     @property
     def is_counted(self) -> bool:
@@ -108,19 +128,42 @@ def build_measure(step: SnapshotEvaluation, problem: StepProblem, measure: str) 
     if measure == "error":
         start = compute_vertex_distances(system, problem.current_positions, lowest.positions)[0]
         return lambda p: compute_vertex_distances(system, p, lowest.positions)[0] / start
-    scale = problem.value(problem.current_positions) - lowest.objective
-    return lambda p: (problem.value(p) - lowest.objective) / scale
+    return build_gap(problem, lowest.objective)
+
+
+def build_gap(problem: StepProblem, lowest: float) -> Callable[[Positions], float]:
+    """Return the function that computes the gap of positions relative to a minimum with this objective [J]."""
+    scale = problem.value(problem.current_positions) - lowest
+    return lambda p: (problem.value(p) - lowest) / scale
+
+
+def find_own_minimum(prepared: PreparedSolver, problem: StepProblem) -> float:
+    """Return the objective [J] of the certified minimum to which a method converges, NaN if it is none."""
+    found = certify_minimum(problem, prepared.solve(problem, CONVERGED).positions)
+    return found.objective if found.is_certified else np.nan
 
 
 def build_candidate(
-    spec: CurveSpec, problem: StepProblem, compute_measure: Callable[[Positions], float], targets: Sequence[float]
+    spec: CurveSpec,
+    problem: StepProblem,
+    compute_measure: Callable[[Positions], float] | None,
+    targets: Sequence[float],
 ) -> CandidateSolve | None:
-    """Run the first pass of a method until it reaches all accuracies; return None if the scene is unsupported."""
+    """Run the first pass of a method until it reaches all accuracies; return None if the scene is unsupported.
+
+    Args:
+        spec: the method and its limits.
+        problem: the step.
+        compute_measure: measure of an iterate; None for the gap relative to the method's own minimum.
+        targets: accuracies.
+    """
     try:
         prepared = load_target(SOLVER_TABLE[spec.solver.name])(**spec.solver.parameters).prepare(problem.system)
         next(prepared.iterates(problem))  # compiles
     except Unsupported:
         return None
+    own_minimum = find_own_minimum(prepared, problem) if compute_measure is None else np.nan
+    compute_measure = compute_measure or build_gap(problem, own_minimum)
     num_iterations, seconds = dict[float, int](), dict[float, float]()
     iterates, spent = prepared.iterates(problem), 0.0
     for number in range(1, spec.max_iterations + 1):
@@ -133,7 +176,7 @@ def build_candidate(
                 num_iterations[target], seconds[target] = number, spent
         if len(num_iterations) == len(targets) or spent > spec.measurement.time_limit or not np.isfinite(remaining):
             break
-    return CandidateSolve(spec.solver.name, prepared, num_iterations, seconds)
+    return CandidateSolve(spec.solver.name, prepared, num_iterations, seconds, own_minimum)
 
 
 def measure_iterate_seconds(prepared: PreparedSolver, problem: StepProblem, numbers: Sequence[int]) -> list[float]:
@@ -198,7 +241,7 @@ def measure_step(
     draws = rng.integers(rounds, size=(NUM_RESAMPLES, rounds))
     for guess in specs[0].initial_guesses:
         problem = step.step_snapshot.build_problem(guess)
-        compute_measure = build_measure(step, problem, measure)
+        compute_measure = None if measure == "own-gap" else build_measure(step, problem, measure)
         candidates = [found for spec in specs if (found := build_candidate(spec, problem, compute_measure, targets))]
         least = {t: min((one.seconds[t] for one in candidates if t in one.seconds), default=np.inf) for t in targets}
         timed = [
@@ -209,8 +252,13 @@ def measure_step(
         ]
         times = {name: {}} | measure_interleaved(timed, problem, rounds)
         title = f"{step.case.title} {step.snapshot_name} {guess}"
+        excess = np.nan
+        if compute_measure is None:
+            lowest, start = step.known_minima.lowest_minimum.objective, problem.value(problem.current_positions)
+            own = next((one.own_minimum for one in candidates if one.name == name), np.nan)
+            excess = (own - lowest) / (start - lowest)
         found = (compute_ratio(title, target, name, times, draws) for target in targets)
-        yield from (one for one in found if one is not None)
+        yield from (replace(one, excess=excess) for one in found if one is not None)
 
 
 def format_ratio(one: TimeRatio) -> str:
