@@ -27,6 +27,7 @@ from springbench.solvers.jit.kernel_compilation import jit_closure, jit_inner_op
 from springbench.solvers.kernels.iteration_loop import (
     REASON_ITERATIONS,
     REASON_STALLED,
+    LoopLimits,
     build_unchecked_steps,
     check_residual,
 )
@@ -68,6 +69,7 @@ ROUND_STATE_DTYPE = np.dtype(
         ("segment_end", np.int64),  # iterations after which sweeps may follow
         ("segment_residual", np.float64),  # residual at the last choice [J^(1/2)]; 0: not known
         ("round_decrease", np.float64),  # decrease of the objective before the round [J]
+        ("residual_floor", np.float64),  # residual that rounded positions leave [J^(1/2)]
     ]
 )
 """The state of the rounds of a solve."""
@@ -96,7 +98,11 @@ def _choose_sweeps(now, decrease, residual):
 @register_jitable(**jit_inner_options)
 def _assess_round(now, decrease, residual, residual_limit):
     """Return REASON_SWITCH if another method is predicted to gain more, else REASON_ITERATIONS."""
-    if now.num_iterations == PROBE_ITERATIONS and residual > _FAST_RESIDUAL_RATIO * now.initial_residual:
+    if (
+        now.num_iterations == PROBE_ITERATIONS
+        and now.is_sweeping == 0
+        and residual > _FAST_RESIDUAL_RATIO * now.initial_residual
+    ):
         now.is_unsuited = 1
         return REASON_SWITCH
     if now.num_iterations < now.group_end:
@@ -117,6 +123,7 @@ def _assess_round(now, decrease, residual, residual_limit):
 def build_rounds(
     run_unchecked: Callable[..., Any],
     residual: Callable[..., Any],
+    estimated_residual: Callable[..., Any],
     decrease: Callable[..., Any],
     sweep: Callable[..., Any],
 ) -> Callable[..., Any]:
@@ -125,21 +132,29 @@ def build_rounds(
     Args:
         run_unchecked: function of the state and a number of iterations that does them and returns how many succeeded.
         residual: function of the state that returns the residual [J^(1/2)].
+        estimated_residual: function of the state that returns it up to round-off, or nan. It is used unless it is
+            within a factor of two of a limit.
         decrease: function of the state that returns the decrease of the objective since the start [J].
         sweep: function of the state that does a round of sweeps.
 
     Returns:
         A function (state, rounds, limits), `rounds` of `ROUND_STATE_DTYPE` (1,) and limits in rounds. It returns the
         number of rounds, the last residual and the termination reason. Without a limit of the residual, it is computed
-        only where a decision needs it, and by a call for no rounds; else it is nan.
+        only where a decision needs it, and by a call for no rounds; else it is nan. The floor of the limits and that of
+        the rounds end the loop.
     """
 
     def iterate(state: Any, rounds: Any, limits: Any) -> Any:
         now, count, found, ended = rounds[0], 0, np.nan, REASON_ITERATIONS
         if limits.max_iterations == 0:
             return 0, residual(state), REASON_ITERATIONS
+        floor = max(limits.residual_floor, now.residual_floor)
+        limits = LoopLimits(limits.max_iterations, limits.residual_limit, floor, limits.residual_mode)
+        near_limit = 2.0 * max(limits.residual_limit, floor)
         if now.initial_residual < 0.0:
-            now.initial_residual = now.group_residual = now.segment_residual = residual(state)
+            found = estimated_residual(state)
+            found = found if found > near_limit else residual(state)
+            now.initial_residual = now.group_residual = now.segment_residual = found
         while ended == REASON_ITERATIONS and count < limits.max_iterations:
             count += 1
             size = now.sweep_cost if now.is_sweeping == 1 else round_size(now)
@@ -154,7 +169,8 @@ def build_rounds(
             is_assessed = now.num_iterations == PROBE_ITERATIONS or now.num_iterations >= now.group_end
             found = np.nan
             if limits.residual_limit > 0.0 or ends_segment or is_assessed or not is_done:
-                found = residual(state)
+                found = estimated_residual(state)
+                found = found if found > near_limit else residual(state)
                 ended = check_residual(found, limits)
             if ends_segment:
                 _choose_sweeps(now, total, found)
@@ -169,6 +185,7 @@ def build_rounds(
 def build_compiled_rounds(
     step_state: Callable[..., Any],
     residual: Callable[..., Any],
+    estimated_residual: Callable[..., Any],
     decrease: Callable[..., Any],
     sweep: Callable[..., Any],
 ) -> Any:
@@ -177,6 +194,7 @@ def build_compiled_rounds(
     Args:
         step_state: does an iteration and returns whether it succeeded.
         residual: returns the residual [J^(1/2)].
+        estimated_residual: returns it up to round-off, or nan.
         decrease: returns the decrease of the objective since the start [J].
         sweep: does a round of sweeps.
 
@@ -184,7 +202,7 @@ def build_compiled_rounds(
         The function of `build_rounds`, compiled.
     """
 
-    return jit_closure(build_rounds(build_unchecked_steps(step_state), residual, decrease, sweep))
+    return jit_closure(build_rounds(build_unchecked_steps(step_state), residual, estimated_residual, decrease, sweep))
 
 
 def init_rounds(newton_cost: float, check_cost: float, sweep_cost: int = 0, *, starts_sweeping: bool = False) -> Any:

@@ -73,8 +73,12 @@ class SpringForm:
         return out
 
     def negative_energy(self, p: Positions) -> float:
-        """Return the absolute energy [J] of pairs with negative stiffness at p (n, 3)."""
-        return 0.5 * abs(float(np.einsum("ij,ij->", p, self._negative_stiffness @ p))) if self.form_builders else 0.0
+        """Return the absolute energy [J] of pairs with negative stiffness.
+
+        Args:
+            p: positions (n, 3) [m], as of `as_kernel_array`.
+        """
+        return 0.5 * self._sum_squared_stretch.call(*self._negative_pairs, p) if self.form_builders else 0.0
 
     @property
     def has_edges(self) -> bool:
@@ -82,11 +86,11 @@ class SpringForm:
         return bool(self.strain_limits or self.dashpots)
 
     @cached_property
-    def _negative_stiffness(self) -> csr_array:
-        below = self.springs_and_forms.stiffness < 0.0
-        return _zero_length_springs(
-            self.springs_and_forms.edges[below], -self.springs_and_forms.stiffness[below]
-        ).stiffness_matrix(len(self.vertex_weight))
+    def _negative_pairs(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """The pairs with negative stiffness (m, 2), and its absolute value (m,) [N/m]."""
+        pairs = self.springs_and_forms
+        below = pairs.stiffness < 0.0
+        return pairs.edges[below], -pairs.stiffness[below]
 
     def attach_edges(self, springs: Springs) -> AttachedEdges | None:
         """Attach the strain limits and dashpots to springs between the same vertices.

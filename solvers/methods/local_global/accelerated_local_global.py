@@ -71,6 +71,7 @@ class AcceleratedState(SolverState):
 _interpreted_rounds = descent_rounds.build_rounds(
     lambda state, count: state.run_unchecked(count),
     methodcaller("residual"),
+    lambda state: np.nan,
     attrgetter("objective_decrease"),
     lambda state: None,
 )

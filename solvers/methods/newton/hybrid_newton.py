@@ -94,11 +94,9 @@ from springbench.solvers.methods.newton.negative_curvature import (
 from springbench.solvers.methods.newton.newton_direct import NewtonIteration
 from springbench.solvers.methods.newton.predicted_tension import PredictedTensionNewton, compute_objective_decrease
 from springbench.solvers.methods.quasi_newton.lbfgs import Lbfgs
+from springbench.solvers.methods.quasi_newton.lbfgs_with_sweeps import LbfgsSweepEngine, LbfgsSweepState
 from springbench.solvers.methods.quasi_newton.sweep_rounds import ROUND_SWEEPS
-from springbench.solvers.methods.quasi_newton.windowed_acceleration import (
-    CompiledAccelerationState,
-    PreparedAccelerated,
-)
+from springbench.solvers.methods.quasi_newton.windowed_acceleration import PreparedAccelerated
 from springbench.solvers.model.barrier_energy import ignore_barriers, without_barriers
 from springbench.solvers.model.step_problem import Positions, PreparedSolver, StepProblem, System
 from springbench.solvers.objective.fixed_objective import FixedObjective
@@ -130,9 +128,9 @@ _MAX_SHIFT = 1e3
 NO_GRADIENT = np.empty((0, 3))
 """Placeholder for the gradient at a point of L-BFGS: the residual there is known, and the gradient is not used."""
 
-_LBFGS_NANOSECONDS, _SWEEP_NANOSECONDS, _NEWTON_NANOSECONDS = (1e3, 17.0, 2.0), (5e2, 10.0), (2e5, 0.023, 20.0)
-"""Costs of an L-BFGS iteration (constant, per spring, per entry of the factor), of a sweep (constant, per spring) and
-of a Newton step (constant, per flop, per entry), fitted to 16 scenes of 6 to 4096 vertices on one core with AVX-512;
+_LBFGS_NANOSECONDS, _SWEEP_NANOSECONDS, _NEWTON_NANOSECONDS = (7e2, 26.0, 1.2), (6e2, 10.0), (4e4, 0.023, 5.4)
+"""Costs of an L-BFGS iteration (constant, per vertex, per entry of the factor), of a sweep (constant, per spring) and
+of a Newton step (constant, per flop, per entry), fitted to 31 scenes of 6 to 16384 vertices on one core with AVX-512;
 their ratio alone matters."""
 
 _MAX_SWEEP_RATIO = float(np.finfo(np.float64).eps) ** -0.5
@@ -143,9 +141,12 @@ _SWEEP_FIRST_RATIO = 500.0
 """Largest ratio of the diagonal of Q to the inertia at which a solve starts with sweeps: Chebyshev's iteration then
 divides the objective by ten in about as many sweeps as a group has iterations."""
 
-_RESIDUAL_COST, _COLLISION_CHECK_COST = 0.1, 20.0
-"""Costs of a residual and of a check for collisions, in iterations of L-BFGS: 0.04 to 0.3 on 15 scenes of 9 to 4096
-vertices, and 10 to 100 on folded cloths of 85 to 396 vertices."""
+ONE_ROUND = LoopLimits(1, 0.0, 0.0, RESIDUAL_EACH)
+"""The limits of rounds for `ONE_ITERATION`."""
+
+_ROUND_END_COST, _COLLISION_CHECK_COST = 0.1, 20.0
+"""Costs of the end of a round and of a check for collisions, in iterations of L-BFGS: 0.01 to 0.4 for a call of the
+compiled rounds on 28 scenes of 81 to 16384 vertices, and 10 to 100 on folded cloths of 85 to 396 vertices."""
 
 
 @dataclass(frozen=True)
@@ -380,9 +381,8 @@ class LbfgsFirstState(HybridState):
     preparation of the other methods would cost as much as such a step.
     """
 
-    _run: CompiledAccelerationState | None = None
-    _limits: LoopLimits | None = None  # the last ones, and those of rounds
-    _round_limits = ONE_ITERATION
+    _run: LbfgsSweepState | None = None
+    _limits, _round_limits = ONE_ITERATION, ONE_ROUND  # the last ones, and those of rounds
     _num_rounds = 0
     _is_lbfgs_alone = True
 
@@ -392,14 +392,13 @@ class LbfgsFirstState(HybridState):
 
     def compute_start_residual(self) -> float:
         """Start L-BFGS and return the residual [J^(1/2)] at the initial guess."""
-        return self._start_run(measures_guess=True).guess_residual
+        return self._prepare_run().start_lower(self._rounds)
 
-    def _start_run(self, *, measures_guess: bool) -> CompiledAccelerationState:
-        """Start L-BFGS; `measures_guess` states whether the residual at the guess is needed."""
+    def _prepare_run(self) -> LbfgsSweepState:
+        """Prepare L-BFGS, which the first rounds start."""
         method = self._prepared.method
-        run = self._run = method.start_lower(self._problem, self.positions, measures_guess=measures_guess)
-        self._start, self._rounds = run.positions.copy(), method.init_rounds()
-        self._floor = method.round_off(self._start)
+        run = self._run = method.prepare_lower_start(self._problem, self.positions)
+        self._rounds = method.init_rounds()
         return run
 
     def run_iterations(self, limits: LoopLimits) -> tuple[int, float, int]:
@@ -412,19 +411,23 @@ class LbfgsFirstState(HybridState):
         """Do rounds of L-BFGS as long as it is alone."""
         if not self._is_lbfgs_alone:
             return super()._advance(limits)
-        control, run = self._control, self._run or self._start_run(measures_guess=False)
+        control, run = self._control, self._run or self._prepare_run()
         if control.must_escape:
             self._end_lbfgs_alone(run, np.inf, REASON_ITERATIONS)
             return super()._advance(limits)
         if limits is not self._limits:
-            self._limits, self._round_limits = limits, limit_rounds(limits, self._floor)
+            self._limits, self._round_limits = limits, limit_rounds(limits)
         count, residual, ended = run.run_rounds(self._rounds, self._round_limits)
         control.num_iterations, control.residual = count, None if isnan(residual) else residual
         self._num_rounds += count
         self.positions = run.positions
-        if ended in (REASON_STALLED, REASON_SWITCH) or residual <= self._floor:
+        if ended != REASON_ITERATIONS and self._is_lbfgs_done(residual, ended):
             self._end_lbfgs_alone(run, residual, ended)
         return True
+
+    def _is_lbfgs_done(self, residual: float, ended: int) -> bool:
+        """Return whether another method follows after rounds that ended for this reason."""
+        return ended in (REASON_STALLED, REASON_SWITCH) or residual <= self._rounds["residual_floor"][0]
 
     def residual(self) -> float:
         """Return the residual [J^(1/2)] at the current positions."""
@@ -432,13 +435,14 @@ class LbfgsFirstState(HybridState):
             self._control.residual = self._run.run_rounds(self._rounds, NO_ITERATIONS)[1]
         return super().residual()
 
-    def _end_lbfgs_alone(self, run: CompiledAccelerationState, residual: float, ended: int) -> None:
+    def _end_lbfgs_alone(self, run: LbfgsSweepState, residual: float, ended: int) -> None:
         """End the phase of L-BFGS alone, and continue with the choice between the methods."""
         method, control = self._prepared.method, self._control
         control.solver_phases, self._is_lbfgs_alone, self._run = self._count_rounds(), False, None
         self._point = DescentPoint(run.positions.copy(), NO_GRADIENT)
         self.positions = self._point.positions
-        method_choice = MethodChoice(method, self._step, self._start, run, control, self._rounds, self._point)
+        start = run.start_positions
+        method_choice = MethodChoice(method, self._step, start, run, control, self._rounds, self._point)
         method_choice.record_rounds(residual, ended)
         self._points = method.continue_from(self._step, self._point, control, method_choice)
 
@@ -455,17 +459,10 @@ class LbfgsFirstState(HybridState):
         return {"lbfgs": (self._num_rounds, groups / self._prepared.method.newton_cost, 0.0)}
 
 
-def limit_rounds(limits: LoopLimits, floor: float) -> LoopLimits:
-    """Return the limits of rounds.
-
-    Rounds also end where the residual is due to rounded positions.
-
-    Args:
-        limits: limits of the solve.
-        floor: residual [J^(1/2)] that rounded positions leave.
-    """
+def limit_rounds(limits: LoopLimits) -> LoopLimits:
+    """Return the limits of rounds of a solve with these limits."""
     limit = limits.residual_limit if limits.residual_mode == RESIDUAL_EACH else 0.0
-    return LoopLimits(limits.max_iterations, limit, max(floor, limits.residual_floor), RESIDUAL_EACH)
+    return LoopLimits(limits.max_iterations, limit, limits.residual_floor, RESIDUAL_EACH)
 
 
 class MeasuredRule(ShiftScheduleRule):
@@ -572,19 +569,21 @@ class HybridIteration:
         is_exact = is_exact and objective.system is without_vertex_contact(objective.system)
         self.exact_lbfgs = lbfgs if is_exact else None
         is_projective = objective.projective_indices.issuperset(objective.element_energy_indices)
-        self.starts_lower = is_exact and is_projective and lbfgs.can_start_lower
+        engine = lbfgs.acceleration_engine
+        self._sweep_engine = engine if isinstance(engine, LbfgsSweepEngine) else None
+        self.starts_lower = is_exact and is_projective and self._sweep_engine is not None
         springs, entries = len(objective.springs.stiffness), lbfgs.stats.get("nnz_factor", 0.0)
-        constant, per_spring, per_entry = _LBFGS_NANOSECONDS
-        lbfgs_cost = constant + per_spring * springs + per_entry * entries
+        constant, per_vertex, per_entry = _LBFGS_NANOSECONDS
+        lbfgs_cost = constant + per_vertex * objective.system.num_vertices + per_entry * entries
         constant, per_flop, per_entry = _NEWTON_NANOSECONDS
         newton_cost = constant + per_flop * factor.flops + per_entry * factor.nonzeros
         self.newton_cost = newton_cost / (GROUP_ITERATIONS * lbfgs_cost)
         constant, per_spring = _SWEEP_NANOSECONDS
         sweep_cost = ROUND_SWEEPS * (constant + per_spring * springs)
-        has_sweeps = lbfgs.can_start_lower and bool((metric.free_diagonal <= _MAX_SWEEP_RATIO * inertia).all())
-        self.sweep_cost = max(1, round(sweep_cost / lbfgs_cost)) if has_sweeps else 0
+        has_sweeps = self._sweep_engine is not None and bool((metric.free_diagonal <= _MAX_SWEEP_RATIO * inertia).all())
+        self.sweep_cost = 1 + round(sweep_cost / lbfgs_cost) if has_sweeps else 0
         self.starts_sweeping = has_sweeps and bool((metric.free_diagonal <= _SWEEP_FIRST_RATIO * inertia).all())
-        check_cost = _COLLISION_CHECK_COST if objective.has_barriers else _RESIDUAL_COST
+        check_cost = _COLLISION_CHECK_COST if objective.has_barriers else _ROUND_END_COST
         rounds = init_rounds(self.newton_cost, check_cost, self.sweep_cost, starts_sweeping=self.starts_sweeping)
         self._initial_rounds = rounds.tobytes()
 
@@ -661,15 +660,15 @@ class HybridIteration:
         """
         return self._lbfgs.init_state(self._without_barriers(step.problem), p)
 
-    def start_lower(self, problem: StepProblem, guess: Positions, *, measures_guess: bool) -> CompiledAccelerationState:
-        """Start L-BFGS at the lower one of the guess and the inertial prediction, if `starts_lower`.
+    def prepare_lower_start(self, problem: StepProblem, guess: Positions) -> LbfgsSweepState:
+        """Prepare a start of L-BFGS at the lower one of the guess and the inertial prediction, if `starts_lower`.
 
         Args:
             problem: step whose objective is minimised.
             guess: initial guess (n, 3) [m].
-            measures_guess: whether the residual at the guess is needed.
         """
-        return self._lbfgs.init_lower_state(self._without_barriers(problem), guess, measures_guess=measures_guess)
+        assert self._sweep_engine is not None
+        return self._sweep_engine.init_lower_state(self._without_barriers(problem), guess)
 
     def _without_barriers(self, problem: StepProblem) -> StepProblem:
         return ignore_barriers(problem) if self._system_has_barriers else problem
@@ -736,7 +735,7 @@ class MethodChoice:
         self._num_lbfgs_iterations, self._rival_gain = 0, 0.0  # last values read from and written to `rounds`
         self._measured_rule: MeasuredRule | None = None
         self._steepest = 0.0
-        self._floor = method.round_off(start)
+        rounds["residual_floor"] = self._floor = method.round_off(start)
         self._predicting: PredictedTensionNewton | None = None
         self._gains = {"lbfgs": np.inf, "predicted tensions": 0.0, "newton": 0.0}  # [J] per cost of a group
         self._name = ""
@@ -800,7 +799,7 @@ class MethodChoice:
         rival_gain = max(self._gains["predicted tensions"], self._gains["newton"])
         if rival_gain != self._rival_gain:
             rounds["rival_gain"] = self._rival_gain = rival_gain
-        count, residual, ended = self._run.run_rounds(rounds, limit_rounds(limits, self._floor))
+        count, residual, ended = self._run.run_rounds(rounds, limit_rounds(limits))
         done = int(rounds["num_iterations"][0]) - self._num_lbfgs_iterations
         self._control.add_phase("lbfgs", count, done / GROUP_ITERATIONS / self._method.newton_cost)
         if self._method.exact_lbfgs and not isnan(residual):

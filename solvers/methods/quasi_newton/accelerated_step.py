@@ -56,16 +56,29 @@ class AcceleratedStep(NamedTuple):
     objective_values: NDArray[np.float64]
 
 
-START_AT_GUESS, START_LOWER, START_LOWER_MEASURED = range(3)
-"""Where a solve starts: at the guess, or at the lower one of the guess and the inertial prediction; the last one also
-measures the residual at the guess."""
-
-
 @jit_kernel
-def start_solve(
-    step: AcceleratedStep, window: AccelerationWindow, target, force, pin_targets, guess, external_force, start, out
-):
-    """Start the solve of a step.
+def start_solve(step: AcceleratedStep, window: AccelerationWindow, target, force, pin_targets, guess):
+    """Start the solve of a step at a guess.
+
+    Args:
+        step: data of the system; its vectors and objective values are overwritten.
+        window: state of the solve, initialised at the start.
+        target: inertial target (n, 3) [m].
+        force: external force and constant force of the forms (n, 3) [N].
+        pin_targets: target positions of the pins (q, 3) [m].
+        guess: initial guess (n, 3) [m].
+
+    Returns:
+        The residual [J^(1/2)] at the guess.
+    """
+    _evaluate_guess(step, window, target, force, pin_targets, guess)
+    _start_window(step, window)
+    return compute_window_residual((step, window))
+
+
+@jit_inner
+def start_lower_solve(step, window, target, force, pin_targets, guess, external_force, measures_guess, out):
+    """Start the solve of a step at the lower one of a guess and the inertial prediction.
 
     Args:
         step: data of the system; its vectors and objective values are overwritten.
@@ -75,24 +88,23 @@ def start_solve(
         pin_targets: target positions of the pins (q, 3) [m].
         guess: initial guess (n, 3) [m].
         external_force: force of the inertial prediction (n, 3) [N].
-        start: START_AT_GUESS, START_LOWER or START_LOWER_MEASURED.
-        out: output (n, 3) [m], the positions at the start; unchanged by START_AT_GUESS.
+        measures_guess: whether the residual at the guess is computed.
+        out: output (n, 3) [m], the positions at the start.
 
     Returns:
-        The residual [J^(1/2)] at the guess, NaN unless it is measured or the solve starts there, and at the start.
+        The residual [J^(1/2)] at the guess, NaN if it is not computed.
     """
-    rows, size = step.vertex_rows, len(window.direction)
-    write_right_hand_side(rows, target, force, pin_targets, step.right_hand_side)
-    write_positions(rows, guess, pin_targets, window.trial_position)
-    step.objective_values[0] = evaluate_trial(step, window)
-    at_guess, is_lower = np.nan, False
-    if start == START_LOWER_MEASURED:
-        at_guess = _start_window(step, window)
-    if start != START_AT_GUESS:
-        for k in range(size):
-            window.position[k], window.descent[k] = window.trial_position[k], window.trial_descent[k]
-        predict_positions(rows.inertia_diagonal, target, external_force, rows.pinned_vertices, pin_targets, out)
-        write_positions(rows, out, pin_targets, window.trial_position)
+    rows, size, at_guess = step.vertex_rows, len(window.direction), np.nan
+    _evaluate_guess(step, window, target, force, pin_targets, guess)
+    if measures_guess:
+        _start_window(step, window)
+        at_guess = compute_window_residual((step, window))
+    for k in range(size):
+        window.position[k], window.descent[k] = window.trial_position[k], window.trial_descent[k]
+    predict_positions(rows.inertia_diagonal, target, external_force, rows.pinned_vertices, pin_targets, out)
+    write_positions(rows, out, pin_targets, window.trial_position)
+    is_lower = False
+    if _differs(window.trial_position, window.position, size):
         there = evaluate_trial(step, window)
         is_lower = there < step.objective_values[0]
         if is_lower:
@@ -101,21 +113,38 @@ def start_solve(
             for k in range(size):
                 window.trial_position[k], window.trial_descent[k] = window.position[k], window.descent[k]
             read_positions(rows, window.trial_position, out)
-    total = step.objective_weights.energy_scale
+    if is_lower or not measures_guess:
+        _start_window(step, window)
+    return at_guess
+
+
+@jit_inner
+def _differs(one, other, size):
+    """Return whether any of the first entries of two vectors differ."""
+    differs = False
     for k in range(size):
-        total += step.iteration_plan.anchor_stiffness[k // 4] * window.trial_position[k] ** 2
-    step.objective_values[1] = total
-    at_start = _start_window(step, window) if is_lower or start != START_LOWER_MEASURED else at_guess
-    window.window_state[0].objective_decrease = 0.0
-    return (at_guess if is_lower else at_start), at_start
+        differs |= one[k] != other[k]
+    return differs
+
+
+@jit_inner
+def _evaluate_guess(step, window, target, force, pin_targets, guess):
+    """Write the right-hand side of a step, and evaluate the guess as a trial."""
+    write_right_hand_side(step.vertex_rows, target, force, pin_targets, step.right_hand_side)
+    write_positions(step.vertex_rows, guess, pin_targets, window.trial_position)
+    step.objective_values[0] = evaluate_trial(step, window)
 
 
 @jit_inner
 def _start_window(step, window):
-    """Start the window at the trial point and return the residual [J^(1/2)] there."""
+    """Start the window at the trial point."""
+    total = step.objective_weights.energy_scale
+    for k in range(len(window.direction)):
+        total += step.iteration_plan.anchor_stiffness[k // 4] * window.trial_position[k] ** 2
+    step.objective_values[1] = total
     solve_trial(step, window)
     init_window(window, step.solution_rows)
-    return compute_window_residual((step, window))
+    window.window_state[0].objective_decrease = 0.0
 
 
 @jit_inner

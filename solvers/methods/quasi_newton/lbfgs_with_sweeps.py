@@ -5,14 +5,23 @@ The kernels are those of `springbench.solvers.methods.quasi_newton.sweep_rounds`
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Self
 
+import numpy as np
 from numpy.typing import NDArray
 from springbench.solvers.jit.typed_kernel import TypedKernel
-from springbench.solvers.kernels.iteration_loop import LoopLimits
+from springbench.solvers.kernels.iteration_loop import NO_ITERATIONS, LoopLimits
 from springbench.solvers.methods.local_global.accelerated_local_global import AccelerationScheme
 from springbench.solvers.methods.local_global.fused_local_global import PreparedCompiledLocalGlobal
-from springbench.solvers.methods.quasi_newton.sweep_rounds import NOT_STARTED, SweepStep, run_sweep_rounds
+from springbench.solvers.methods.quasi_newton.sweep_rounds import (
+    CONTINUES,
+    NOT_STARTED,
+    STARTS,
+    STARTS_MEASURED,
+    StepArrays,
+    SweepStep,
+    run_sweep_rounds,
+)
 from springbench.solvers.methods.quasi_newton.windowed_acceleration import (
     AccelerationMemory,
     CompiledAccelerationState,
@@ -36,10 +45,25 @@ class LbfgsSweepEngine(CompiledEngine):
         system, radius = compiled.base.system, vbd.VertexBlockDescent().spectral_radius
         parts = vbd.decompose_system(system, "hybrid")
         self.sweeps = vbd.PreparedVertexBlockDescent.from_blocks(system, *parts, radius, compiled)
-        self.round_kernel = TypedKernel(run_sweep_rounds)
+        self.round_kernel, self.unpinned_trace = TypedKernel(run_sweep_rounds), compiled.base.unpinned_trace
 
-    def _init_state(self, problem: StepProblem, guess: Positions, start: int) -> LbfgsSweepState:
-        return LbfgsSweepState(self, problem, guess, start)
+    def init_state(self, problem: StepProblem, initial_guess: Positions) -> LbfgsSweepState:
+        """Start a solve from an initial guess.
+
+        Args:
+            problem: step whose objective is minimised.
+            initial_guess: positions (n, 3) [m], not modified.
+        """
+        return LbfgsSweepState(self, problem, initial_guess).start_at_guess()
+
+    def init_lower_state(self, problem: StepProblem, initial_guess: Positions) -> LbfgsSweepState:
+        """Prepare a solve whose first rounds start it at the lower one of a guess and the inertial prediction.
+
+        Args:
+            problem: step whose objective is minimised.
+            initial_guess: positions (n, 3) [m], not modified.
+        """
+        return LbfgsSweepState(self, problem, initial_guess)
 
     def _allocate_memory(self) -> AccelerationMemory:
         made = self.sweeps
@@ -47,29 +71,61 @@ class LbfgsSweepEngine(CompiledEngine):
 
 
 class LbfgsSweepState(CompiledAccelerationState):
-    """State of a compiled solve whose rounds alternate with sweeps."""
+    """State of a compiled solve whose rounds alternate with sweeps.
 
-    def __init__(self, engine: LbfgsSweepEngine, problem: StepProblem, guess: Positions, start: int) -> None:
-        """Start a solve.
+    Attributes:
+        start_positions: positions (n, 3) [m] at which the first rounds started the solve.
+    """
+
+    def __init__(self, engine: LbfgsSweepEngine, problem: StepProblem, guess: Positions) -> None:
+        """Prepare a solve.
 
         Args:
             engine: iteration of the system.
             problem: step whose objective is minimised.
             guess: initial guess (n, 3) [m].
-            start: START_AT_GUESS, START_LOWER or START_LOWER_MEASURED.
         """
-        super().__init__(engine, problem, guess, start)
+        super().__init__(engine, problem, guess)
         _, _, sweeps = self._memory
-        sweeps.sweep_memory.sweep_scratch.omega[0] = NOT_STARTED
         if (memory := engine.sweeps.update_packets(sweeps.sweep_memory, problem)) is not sweeps.sweep_memory:
             sweeps = sweeps._replace(sweep_memory=memory)
-        self._round_kernel, self._sweeps = engine.round_kernel, sweeps
+        self.start_positions = np.empty(guess.shape)
+        arrays = StepArrays(*self._step_arrays, self._external_force, self.start_positions, self.positions)
+        self._round_arguments = *self._state, sweeps, arrays
+        self._round_kernel, self._trace, self._start_kind = engine.round_kernel, engine.unpinned_trace, STARTS
+
+    def start_at_guess(self) -> Self:
+        """Start the solve at the initial guess; return the state."""
+        self._round_arguments[2].sweep_memory.sweep_scratch.omega[0] = NOT_STARTED
+        self._start_kind = CONTINUES
+        return super().start_at_guess()
+
+    def start_lower(self, rounds: NDArray[Any]) -> float:
+        """Start the solve at the lower one of the guess and the inertial prediction.
+
+        Args:
+            rounds: state of the rounds (1,), updated.
+
+        Returns:
+            The residual at the guess [J^(1/2)].
+        """
+        return self._start_lower(rounds, STARTS_MEASURED)
+
+    def _start_lower(self, rounds: NDArray[Any], start: int) -> float:
+        """Start the solve without rounds; return the residual at the guess [J^(1/2)], NaN if it is not measured."""
+        self._start_kind = CONTINUES
+        residual = self._round_kernel.call(*self._round_arguments, start, self._trace, rounds, NO_ITERATIONS)[3]
+        self._add_energy_scales(self.start_positions)
+        return residual
 
     def run_rounds(self, rounds: NDArray[Any], limits: LoopLimits) -> tuple[int, float, int]:
-        """Run rounds of iterations within the limits, compiled.
+        """Run rounds of iterations within the limits, compiled; the first ones start the solve.
 
         Args:
             rounds: state of the rounds (1,), updated.
             limits: limits, in rounds.
         """
-        return self._round_kernel.call(*self._state, self._sweeps, self._step_arrays, rounds, limits, self.positions)
+        if self._start_kind != CONTINUES and self._engine.has_energy_scales:
+            self._start_lower(rounds, STARTS)
+        start, self._start_kind = self._start_kind, CONTINUES
+        return self._round_kernel.call(*self._round_arguments, start, self._trace, rounds, limits)[:3]

@@ -12,9 +12,13 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
 from springbench.solvers.jit.kernel_compilation import jit_inner, jit_kernel
 from springbench.solvers.kernels.accelerated_descent import AccelerationWindow, accept_trial
 from springbench.solvers.kernels.descent_rounds import build_compiled_rounds
+from springbench.solvers.kernels.iteration_loop import REASON_ITERATIONS
+from springbench.solvers.kernels.objective_kernels import compute_max_magnitude
 from springbench.solvers.kernels.step_setup import VertexRows, read_positions
 from springbench.solvers.methods.quasi_newton.accelerated_step import (
     AcceleratedStep,
@@ -22,21 +26,26 @@ from springbench.solvers.methods.quasi_newton.accelerated_step import (
     compute_window_residual,
     evaluate_trial,
     solve_trial,
+    start_lower_solve,
     step_state,
 )
 from springbench.solvers.methods.vertex_block.vbd import SweepMemory
-from springbench.solvers.methods.vertex_block.vbd_sweeps import run_iterations, start_sweeps
+from springbench.solvers.methods.vertex_block.vbd_sweeps import restart_sweeps, run_unchecked_sweeps, start_sweeps
+from springbench.solvers.model.rounding_bound import EPS
 from springbench.solvers.simd.dot_products import ordered_dot
 
 ROUND_SWEEPS = 5
 """Sweeps of a round."""
 
-NOT_STARTED = -1.0
-"""Chebyshev factor before the first round of sweeps after an iteration of L-BFGS."""
+NOT_STARTED, MOVED = -2.0, -1.0
+"""Chebyshev factors before the first sweeps of a solve, and before those after an iteration of L-BFGS."""
+
+CONTINUES, STARTS, STARTS_MEASURED = range(3)
+"""Whether rounds continue a solve or start it, and then measure the residual at the initial guess."""
 
 
 class SweepStep(NamedTuple):
-    """The data of sweeps, and the arrays of a solve.
+    """The data of sweeps.
 
     Attributes:
         vertex_rows: rows of the vertices.
@@ -49,17 +58,50 @@ class SweepStep(NamedTuple):
     sweep_memory: SweepMemory
 
 
+class StepArrays(NamedTuple):
+    """The arrays of a solve.
+
+    Attributes:
+        target: inertial target (n, 3) [m].
+        force: external force and constant force of the forms (n, 3) [N].
+        pin_targets: target positions of the pins (q, 3) [m].
+        guess: initial guess (n, 3) [m].
+        external_force: force of the inertial prediction (n, 3) [N].
+        start: output, positions at the start (n, 3) [m].
+        positions: output, positions (n, 3) [m].
+    """
+
+    target: NDArray[np.float64]
+    force: NDArray[np.float64]
+    pin_targets: NDArray[np.float64]
+    guess: NDArray[np.float64]
+    external_force: NDArray[np.float64]
+    start: NDArray[np.float64]
+    positions: NDArray[np.float64]
+
+
 @jit_inner
 def _step_window(state):
-    step, window, sweeps, _, _ = state
-    sweeps.sweep_memory.sweep_scratch.omega[0] = NOT_STARTED
+    step, window, sweeps, _ = state
+    omega = sweeps.sweep_memory.sweep_scratch.omega
+    omega[0] = min(omega[0], MOVED)
     return step_state((step, window))
 
 
 @jit_inner
 def _window_residual(state):
-    step, window, _, _, _ = state
+    step, window, _, _ = state
     return compute_window_residual((step, window))
+
+
+@jit_inner
+def _estimate_residual(state):
+    """Return the square root of grad g' Q^-1 grad g, which includes pinned vertices: nan if there are such unknowns."""
+    step, window, _, _ = state
+    for q in range(len(step.vertex_rows.pin_weight)):
+        if step.vertex_rows.pin_weight[q] < np.inf:
+            return np.nan
+    return np.sqrt(window.window_state[0].correction_squarednorm)
 
 
 @jit_inner
@@ -73,19 +115,25 @@ def _sweep_vertices(state):
 
     Sweeps that follow each other continue Chebyshev's extrapolation.
     """
-    step, window, sweeps, step_arrays, out = state
+    step, window, sweeps, arrays = state
     packets, rows, right, scratch = sweeps.sweep_memory
-    if scratch.omega[0] == NOT_STARTED:
-        read_positions(step.vertex_rows, window.position, out)
-        target, force, pin_targets = step_arrays
-        start_sweeps(sweeps.vertex_rows, target, force, pin_targets, out, right, scratch, rows)
-    run_iterations(packets, None, None, right, sweeps.spectral_radius, scratch, rows, ROUND_SWEEPS)
     source, destination = sweeps.vertex_rows.row_of_vertex, step.vertex_rows.row_of_vertex
+    if scratch.omega[0] == NOT_STARTED:
+        read_positions(step.vertex_rows, window.position, arrays.positions)
+        start_sweeps(
+            sweeps.vertex_rows, arrays.target, arrays.force, arrays.pin_targets, arrays.positions, right, scratch, rows
+        )
+    elif scratch.omega[0] == MOVED:
+        for v in range(len(source)):
+            for c in range(3):
+                rows[4 * source[v] + c] = window.position[4 * destination[v] + c]
+        restart_sweeps(scratch, rows)
+    run_unchecked_sweeps(packets, right, sweeps.spectral_radius, scratch, rows, ROUND_SWEEPS)
     for v in range(len(source)):
         for c in range(3):
             window.trial_position[4 * destination[v] + c] = rows[4 * source[v] + c]
     if not _accept_lower_trial(step, window):
-        scratch.omega[0] = NOT_STARTED
+        scratch.omega[0] = MOVED
 
 
 @jit_inner
@@ -111,7 +159,9 @@ def _accept_lower_trial(step, window):
     return True
 
 
-_iterate_rounds = build_compiled_rounds(_step_window, _window_residual, _window_decrease, _sweep_vertices)
+_iterate_rounds = build_compiled_rounds(
+    _step_window, _window_residual, _estimate_residual, _window_decrease, _sweep_vertices
+)
 
 
 @jit_kernel
@@ -119,25 +169,44 @@ def run_sweep_rounds(
     step: AcceleratedStep,
     window: AccelerationWindow,
     sweeps: SweepStep,
-    step_arrays: Any,
+    arrays: StepArrays,
+    start: Any,
+    unpinned_trace: Any,
     rounds: Any,
     limits: Any,
-    out: Any,
 ):
-    """Run rounds of iterations (`springbench.solvers.kernels.descent_rounds`) and write the positions to `out`.
+    """Run rounds of iterations (`springbench.solvers.kernels.descent_rounds`) and write the positions.
 
     Args:
         step: data of the system; its vectors and objective values are updated.
-        window: state of the solve, from `accelerated_step.start_solve`; updated.
+        window: state of the solve, updated.
         sweeps: data of the sweeps; its arrays of the solve are updated.
-        step_arrays: inertial target [m] and external force [N], (n, 3), and targets of the pins (q, 3) [m].
+        arrays: arrays of the solve.
+        start: CONTINUES, STARTS or STARTS_MEASURED: whether the solve starts first, at the lower one of the guess and
+            the inertial prediction, and whether the residual at the guess is computed.
+        unpinned_trace: sum of the diagonal of Q over the unpinned vertices [N/m], for the residual's round-off.
         rounds: state of the rounds (1,) of type ROUND_STATE_DTYPE, updated.
-        limits: limits of the loop, in rounds.
-        out: positions (n, 3) [m].
+        limits: limits of the loop, in rounds. A start without rounds does not compute the last residual.
 
     Returns:
-        Number of rounds, last residual [J^(1/2)] and termination reason.
+        Number of rounds, last residual [J^(1/2)], termination reason, and the residual at the guess or NaN.
     """
-    answer = _iterate_rounds((step, window, sweeps, step_arrays, out), rounds, limits)
-    read_positions(step.vertex_rows, window.position, out)
-    return answer
+    at_guess, count, residual, ended = np.nan, 0, np.nan, REASON_ITERATIONS
+    if start != CONTINUES:
+        sweeps.sweep_memory.sweep_scratch.omega[0] = NOT_STARTED
+        at_guess = start_lower_solve(
+            step,
+            window,
+            arrays.target,
+            arrays.force,
+            arrays.pin_targets,
+            arrays.guess,
+            arrays.external_force,
+            start == STARTS_MEASURED,
+            arrays.start,
+        )
+        rounds[0].residual_floor = EPS * compute_max_magnitude(arrays.start) * np.sqrt(unpinned_trace)
+    if start == CONTINUES or limits.max_iterations > 0:
+        count, residual, ended = _iterate_rounds((step, window, sweeps, arrays), rounds, limits)
+    read_positions(step.vertex_rows, window.position, arrays.positions)
+    return count, residual, ended, at_guess

@@ -13,7 +13,7 @@ the solve terminates as "stalled" and its iterate stays unchanged.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from springbench.solvers.contact.half_space.vertex_contact import without_vertex_contact
@@ -181,24 +181,6 @@ class PreparedAccelerated(IterativeSolver):
         """
         return self.acceleration_engine.init_state(problem, initial_guess)
 
-    @property
-    def can_start_lower(self) -> bool:
-        """Whether `init_lower_state` is available: all iterations are compiled."""
-        return isinstance(self.acceleration_engine, CompiledEngine)
-
-    def init_lower_state(
-        self, problem: StepProblem, initial_guess: Positions, *, measures_guess: bool
-    ) -> CompiledAccelerationState:
-        """Start a solve at the lower one of an initial guess and the inertial prediction.
-
-        Args:
-            problem: step whose objective is minimised.
-            initial_guess: positions (n, 3) [m], not modified.
-            measures_guess: whether the residual at the guess is needed.
-        """
-        assert isinstance(self.acceleration_engine, CompiledEngine)
-        return self.acceleration_engine.init_lower_state(problem, initial_guess, measures_guess=measures_guess)
-
     def residual_scale(self, problem: StepProblem) -> float:
         """Return the residual scale [J^(1/2)] for the round-off check."""
         return compute_max_coordinate(problem) * self.local_global.unpinned_trace**0.5
@@ -217,6 +199,7 @@ class CompiledEngine:
         self._shares = ObjectiveWeights.from_packets(
             bundles, plan.anchor_stiffness, self._rows.row_of_vertex[pins.vertices[pins.exact_mask]]
         )
+        self.has_energy_scales = bool(self.spring_form.form_builders) or self.spring_form.has_edges
         self.free_memory: list[AccelerationMemory] = []
         self.start_solve, self.run_solve, self.read_positions = (
             TypedKernel(accelerated_step.start_solve),
@@ -247,23 +230,7 @@ class CompiledEngine:
             problem: step whose objective is minimised.
             initial_guess: positions (n, 3) [m], not modified.
         """
-        return self._init_state(problem, initial_guess, accelerated_step.START_AT_GUESS)
-
-    def init_lower_state(
-        self, problem: StepProblem, initial_guess: Positions, *, measures_guess: bool
-    ) -> CompiledAccelerationState:
-        """Start a solve at the lower one of an initial guess and the inertial prediction.
-
-        Args:
-            problem: step whose objective is minimised.
-            initial_guess: positions (n, 3) [m], not modified.
-            measures_guess: whether the residual at the guess is needed.
-        """
-        start = accelerated_step.START_LOWER_MEASURED if measures_guess else accelerated_step.START_LOWER
-        return self._init_state(problem, initial_guess, start)
-
-    def _init_state(self, problem: StepProblem, guess: Positions, start: int) -> CompiledAccelerationState:
-        return CompiledAccelerationState(self, problem, guess, start)
+        return CompiledAccelerationState(self, problem, initial_guess).start_at_guess()
 
     def take_memory(self) -> AccelerationMemory:
         """Return the work arrays of a solve that has ended, or allocate them."""
@@ -275,40 +242,45 @@ AccelerationMemory = tuple[accelerated_step.AcceleratedStep, AccelerationWindow,
 
 
 class CompiledAccelerationState(AcceleratedState):
-    """State of a compiled solve, whose work arrays return to the engine.
+    """State of a compiled solve, whose work arrays return to the engine."""
 
-    Attributes:
-        guess_residual: residual at the initial guess [J^(1/2)], NaN if it is not measured.
-    """
-
-    def __init__(self, engine: CompiledEngine, problem: StepProblem, guess: Positions, start: int) -> None:
-        """Start a solve.
+    def __init__(self, engine: CompiledEngine, problem: StepProblem, guess: Positions) -> None:
+        """Prepare a solve.
 
         Args:
             engine: iteration of the system.
             problem: step whose objective is minimised.
             guess: initial guess (n, 3) [m].
-            start: START_AT_GUESS, START_LOWER or START_LOWER_MEASURED.
         """
         self._engine, self._memory, parts = engine, engine.take_memory(), engine.spring_form
         step, window = self._memory[:2]
         if (packets := parts.update_edges(step.spring_packets, problem)) is not step.spring_packets:
             step = step._replace(spring_packets=packets)
         self._state = step, window
-        target, external, pins, at = map(
-            as_kernel_array, (problem.inertial_target, problem.external_force, problem.pin_targets, guess)
-        )
+        self._external_force = external = as_kernel_array(problem.external_force)
         force = parts.compute_force(problem) if parts.form_builders else external
-        self._step_arrays = target, force, pins
-        self.positions = np.empty(guess.shape)
-        self.guess_residual, self.start_residual = engine.start_solve.call(
-            step, window, target, force, pins, at, external, start, self.positions
+        self._step_arrays = (
+            as_kernel_array(problem.inertial_target),
+            force,
+            as_kernel_array(problem.pin_targets),
+            as_kernel_array(guess),
         )
-        if parts.form_builders or parts.has_edges:
-            p = at if start == accelerated_step.START_AT_GUESS else self.positions
-            step.objective_values[2] = parts.negative_energy(p)
-            if parts.has_edges:
-                step.objective_values[1] += parts.edge_energy_scale(p)
+        self.positions = np.empty(guess.shape)
+
+    def start_at_guess(self) -> Self:
+        """Start the solve at the initial guess; return the state."""
+        self.start_residual = self._engine.start_solve.call(*self._state, *self._step_arrays)
+        if self._engine.has_energy_scales:
+            self._add_energy_scales(self._step_arrays[-1])
+        return self
+
+    def _add_energy_scales(self, p: Positions) -> None:
+        """Add the scales of cancellation in forms and edges at the start p (n, 3) [m]."""
+        parts, values = self._engine.spring_form, self._state[0].objective_values
+        if parts.form_builders:
+            values[2] = parts.negative_energy(p)
+        if parts.has_edges:
+            values[1] += parts.edge_energy_scale(p)
 
     def run_iterations(self, limits: LoopLimits) -> tuple[int, float, int]:
         """Run iterations within the limits; return count, residual and reason."""

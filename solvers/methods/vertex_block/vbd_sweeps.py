@@ -14,6 +14,7 @@ from springbench.solvers.kernels.spring_objective import ObjectiveWeights
 from springbench.solvers.kernels.spring_objective import value_and_descent as objective
 from springbench.solvers.kernels.step_setup import write_positions, write_right_hand_side
 from springbench.solvers.methods.vertex_block.vbd_packets import vbd_newton_step
+from springbench.solvers.simd.dot_products import ordered_dot
 from springbench.solvers.simd.spring_packets import LANES
 
 
@@ -74,6 +75,17 @@ def start_sweeps(vertex_rows, target, force, pin_targets, guess, right, work, p)
     write_positions(vertex_rows, guess, pin_targets, p)
     p[len(p) - 4] = PADDING_COORDINATE
     work.spring_scratch[:], work.packet_sums[:], work.descent_scratch[:] = 0.0, 0.0, 0.0
+    restart_sweeps(work, p)
+
+
+@jit_inner
+def restart_sweeps(work, p):
+    """Forget earlier sweeps.
+
+    Args:
+        work: scratch memory.
+        p: positions in rows of four [m].
+    """
     work.omega[0], work.objective_value[0] = 0.0, np.nan
     for k in range(len(p)):
         work.previous_positions[k] = work.older_positions[k] = p[k]
@@ -139,6 +151,45 @@ def _evaluate_objective(blocks, spaces, elements, p, right, out):
     return objective(blocks.spring_packets, blocks.objective_weights, p, right, out) + half_space_energy(spaces, p)
 
 
+@jit_inner
+def _chebyshev_weight(omega, radius):
+    """Return the Chebyshev factor after omega."""
+    if omega > 1.0:
+        return 4.0 / (4.0 - radius**2 * omega)
+    return 2.0 / (2.0 - radius**2) if omega == 1.0 else 1.0
+
+
+@jit_inner
+def run_unchecked_sweeps(blocks, right, radius, work, p, num_sweeps):
+    """Run sweeps with Chebyshev's extrapolation, without the objective.
+
+    The extrapolation restarts where a sweep turns against the last movement (O'Donoghue and Candes 2015, "Adaptive
+    restart for accelerated gradient schemes": the gradient scheme). This costs a dot product instead of an evaluation
+    of the objective, and the objective may increase.
+
+    Args:
+        blocks: packets of the vertices.
+        right: constant right-hand side [N] by packets, with anchor stiffnesses [N/m].
+        radius: spectral radius of Chebyshev's extrapolation.
+        work: scratch memory.
+        p: positions in rows of four [m], updated.
+        num_sweeps: number of sweeps.
+    """
+    omega, previous, older = work.omega, work.previous_positions, work.older_positions
+    step, size = work.descent_scratch, 4 * blocks.num_free
+    for _ in range(num_sweeps):
+        w = _chebyshev_weight(omega[0], radius)
+        _copy_positions(p, previous)
+        _sweep_vertices(blocks, None, None, right, p, work)
+        for k in range(size):
+            step[k], older[k] = p[k] - previous[k], previous[k] - older[k]
+        omega[0] = w = w if ordered_dot(step, older, size) >= 0.0 else 0.0
+        if w > 1.0:
+            for k in range(size):
+                p[k] = previous[k] - older[k] + w * (step[k] + older[k])
+        _copy_positions(previous, older)
+
+
 def build_iteration(sweep: Any, level: Any) -> Any:
     """Build the iteration from a sweep and the objective.
 
@@ -169,13 +220,7 @@ def build_iteration(sweep: Any, level: Any) -> Any:
         """
         omega, known, older = work.omega, work.objective_value, work.older_positions
         for _ in range(iterations):
-            w = (
-                4.0 / (4.0 - radius**2 * omega[0])
-                if omega[0] > 1.0
-                else 2.0 / (2.0 - radius**2)
-                if omega[0] == 1.0
-                else 1.0
-            )
+            w = _chebyshev_weight(omega[0], radius)
             if w > 1.0 and np.isnan(known[0]):
                 known[0] = level(blocks, spaces, elements, p, right, work.descent_scratch)
             _copy_positions(p, work.previous_positions)
