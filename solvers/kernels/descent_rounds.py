@@ -3,13 +3,14 @@
 After each group of iterations, rounds of sweeps of another first-order method may follow, where there is one.
 
     q = D_k / D_(k-1),   remaining decrease = q D_k + q^2 D_k + ... = D_k q / (1 - q)
-    switch if that per cost of a Newton step exceeds q D_k per round, i.e. if  1 / (1 - q) > cost of a Newton step
+    switch if that per cost of Newton's method exceeds q D_k per round, i.e. if  1 / (1 - q) > cost of two Newton steps
     unless  log(r_k / limit) / log(r_(k-1) / r_k) <= cost of a Newton step
 
 D_k is the decrease of the objective in the k-th group of rounds, and r_k the residual after it: no switch pays if the
-rounds reach the limit of the residual within the cost of one Newton step. Costs are counted in groups, from the numbers
-of entries and operations, and not measured by a clock: equal solves then make equal decisions. Once a Newton step has
-been measured, its decrease per cost replaces the prediction.
+rounds reach the limit of the residual within the cost of one Newton step. Newton's method is assumed to need two steps,
+one of which leads to where the other converges. Costs are counted in groups, from the numbers of entries and
+operations, and not measured by a clock: equal solves then make equal decisions. Once a Newton step has been measured,
+its decrease per cost replaces the prediction.
 
 A round ends with a check, which costs c iterations. Rounds of s iterations cost c/s per iteration, and the last one
 makes s/2 iterations superfluous. With n iterations, n c/s + s/2 is minimal for s = sqrt(2 c n). Rounds have twice that
@@ -51,6 +52,9 @@ they lead to other, higher minima more often."""
 _SWEEP_RESIDUAL_RATIO = 10.0**-0.25
 """Largest ratio of residuals at which more sweeps follow: that of a tenth of the objective in two rounds."""
 
+_NEWTON_STEPS = 2.0
+"""Number of Newton steps that the remaining decrease is assumed to take."""
+
 ROUND_STATE_DTYPE = np.dtype(
     [
         ("num_iterations", np.int64),  # since the start
@@ -60,6 +64,7 @@ ROUND_STATE_DTYPE = np.dtype(
         ("group_start", np.float64),  # decrease of the objective before the group [J]
         ("group_residual", np.float64),  # residual before the group [J^(1/2)]; 0: not known
         ("gain", np.float64),  # decrease in the last group [J]; infinite before the first
+        ("gain_ratio", np.float64),  # over the decrease in the group before; 1 before the second
         ("rival_gain", np.float64),  # decrease of the other methods per cost of a group [J]; 0: not measured
         ("trial_iteration", np.float64),  # iterations from which on a prediction counts
         ("newton_cost", np.float64),  # cost of a Newton step in groups
@@ -110,14 +115,16 @@ def _assess_round(now, decrease, residual, residual_limit):
     before, gain, last_residual = now.gain, decrease - now.group_start, now.group_residual
     now.gain, now.group_start, now.group_residual = gain, decrease, residual
     now.group_end = now.num_iterations + GROUP_ITERATIONS
+    now.gain_ratio = gain / before if 0.0 < before < np.inf else 1.0
     if 0.0 < residual_limit < residual < last_residual:
         left = np.log(residual / residual_limit) / np.log(last_residual / residual)  # groups
         if left <= now.newton_cost:
             return REASON_ITERATIONS
     if gain <= 0.0 or gain < now.rival_gain:
         return REASON_SWITCH
-    gains_more = now.num_iterations >= now.trial_iteration and now.newton_cost * (before - gain) < before
-    return REASON_SWITCH if gains_more else REASON_ITERATIONS
+    if now.num_iterations < now.trial_iteration:
+        return REASON_ITERATIONS
+    return REASON_SWITCH if _NEWTON_STEPS * now.newton_cost * (before - gain) < before else REASON_ITERATIONS
 
 
 def build_rounds(
@@ -216,7 +223,7 @@ def init_rounds(newton_cost: float, check_cost: float, sweep_cost: int = 0, *, s
     """
     initial = np.zeros(1, ROUND_STATE_DTYPE)
     initial["group_end"] = initial["segment_end"] = GROUP_ITERATIONS
-    initial["initial_residual"], initial["gain"] = -1.0, np.inf
+    initial["initial_residual"], initial["gain"], initial["gain_ratio"] = -1.0, np.inf, 1.0
     initial["newton_cost"], initial["check_cost"] = newton_cost, check_cost
     initial["sweep_cost"], initial["is_sweeping"] = sweep_cost, starts_sweeping
     return initial

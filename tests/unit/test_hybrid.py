@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from itertools import count, islice
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -16,13 +17,15 @@ from springbench.harness.simulation.time_loop import prepare, simulate_scene
 from springbench.solvers.iteration.descent_method import DescentPoint, ResidualMetric
 from springbench.solvers.iteration.phase_clock import measure_phases
 from springbench.solvers.kernels import descent_rounds
+from springbench.solvers.kernels.descent_rounds import REASON_SWITCH
+from springbench.solvers.kernels.iteration_loop import REASON_ITERATIONS
 from springbench.solvers.linalg.cholesky import symbolic_factorisation
 from springbench.solvers.linalg.cholesky.block_cholesky import BlockCholesky
 from springbench.solvers.methods.newton import hybrid_newton
 from springbench.solvers.methods.newton.hybrid_newton import HybridNewton, MeasuredRule, PreparedHybrid
 from springbench.solvers.methods.newton.inertia_shift import InertiaShift
 from springbench.solvers.methods.newton.negative_curvature import probe_negative_curvature
-from springbench.solvers.methods.newton.newton_direct import NewtonSolver
+from springbench.solvers.methods.newton.newton_direct import NewtonIteration, NewtonSolver
 from springbench.solvers.methods.quasi_newton.lbfgs import Lbfgs
 from springbench.solvers.methods.quasi_newton.sweep_rounds import ROUND_SWEEPS
 from springbench.solvers.methods.vertex_block.vbd import VertexBlockDescent
@@ -395,6 +398,9 @@ class ShiftedHessian:
         self.num_factorisations += 1.0
         return self.is_definite or bool(np.any(shift))
 
+    def solve(self, b: Positions) -> Positions:
+        return b
+
 
 @pytest.mark.parametrize("is_definite", [True, False])
 def test_only_a_step_by_the_unmodified_hessian_agrees_with_its_model(is_definite: bool):
@@ -410,3 +416,50 @@ def test_only_a_step_by_the_unmodified_hessian_agrees_with_its_model(is_definite
     assert rule.factorise_hessian(hessian, at, inertia) == (0 if is_definite else 1)
     rule.record_step(step, hessian, at, DescentPoint(p - length * at.gradient, at.gradient))
     assert rule.agrees_with_model == is_definite
+
+
+@pytest.mark.parametrize(
+    ("agrees", "decrement_ratio", "gain_ratio", "faster"),
+    [
+        (True, 0.24, 0.5, True),  # 0.5 of the error per group: 0.25 during a step, which costs two groups
+        (True, 0.26, 0.5, False),
+        (True, 0.26, 1.0, True),  # there are no two groups to compare with
+        (False, 0.0, 0.5, False),
+    ],
+)
+def test_newtons_method_continues_if_it_converges_faster_than_lbfgs(agrees, decrement_ratio, gain_ratio, faster):
+    choice: Any = SimpleNamespace(
+        _agrees_with_model=agrees,
+        _rule=SimpleNamespace(decrement_ratio=decrement_ratio),
+        _rounds={"gain_ratio": np.array([gain_ratio])},
+        _method=SimpleNamespace(newton_cost=2.0),
+    )
+    assert hybrid_newton.MethodChoice._converges_faster.fget(choice) is faster
+
+
+@pytest.mark.parametrize(("gain", "reason"), [(0.74, REASON_ITERATIONS), (0.76, REASON_SWITCH)])
+def test_lbfgs_ends_if_two_newton_steps_cost_less_than_what_is_left(gain, reason):
+    """1 / (1 - q) exceeds four groups, the cost of two steps, from q = 3/4 on."""
+    rounds = build_rounds_at(newton_cost=2.0, gain=1.0, group_start=0.0)
+    assert descent_rounds._assess_round(rounds, gain, 1.0, 0.0) == reason
+    assert rounds.gain_ratio == gain
+
+
+def test_the_decrement_ratio_is_that_of_the_hessian_before_the_step():
+    """A solve from near the minimum: the ratio of g'H^-1 g after and before a step, with the factor before it."""
+    given = stiff(1e3)
+    lowest = NewtonSolver().prepare(given.system).solve(given, StopRule(300, 1e-10)).positions
+    objective, metric = FixedObjective(given.system), ResidualMetric(given.system)
+    step = StepObjective(objective, given)
+    p = lowest + 1e-5 * np.sin(np.arange(lowest.size)).reshape(lowest.shape)
+    p = step.apply_exact_pins(p)
+    at = DescentPoint(p, step.gradient(p))
+    inertia = np.repeat(given.system.inertia_diagonal[given.system.free_vertices], 3)
+    rule = MeasuredRule(inertia, objective.hessian_matrix.factor)
+    to, _ = NewtonIteration(metric).next_point(step, at, 0.0, rule)
+    assert rule.agrees_with_model
+    hessian = step.hessian(p)
+    assert hessian.factorise()
+    after, before = (np.sum(g * hessian.solve(g)) for g in (to.gradient, at.gradient))
+    assert rule.decrement_ratio == pytest.approx(after / before, rel=1e-6)
+    assert 0.0 < rule.decrement_ratio < 0.1

@@ -25,9 +25,9 @@ One rule decides which of the three methods continues: that with the largest dec
 last steps. A method that was not yet measured is credited with the decrease that L-BFGS leaves, extrapolated from its
 last two groups of iterations (`springbench.solvers.kernels.descent_rounds`). The exact Hessian is tried first. If it
 has no Cholesky factor, predicted tensions follow, and the exact method is tried again after a cost that doubles with
-each attempt that decreases the objective less than the others did meanwhile. If the Hessian of a step of the exact
-method is unmodified and the decrease agrees with the quadratic model, the next step is predicted to gain more than any
-other method, and the exact method continues until a step does not agree. An indefinite Hessian gets the smallest
+each attempt that decreases the objective less than the others did meanwhile. The exact method continues as long as its
+Hessian is unmodified, the decrease agrees with the quadratic model, and the squared Newton decrement g'H^-1 g falls
+faster per cost than the decrease of L-BFGS fell from group to group. An indefinite Hessian gets the smallest
 multiple of inertia that has a factor (`springbench.solvers.methods.newton.inertia_shift`), or loses negative stiffness
 (`springbench.solvers.methods.newton.hessian_regularisation`), whichever decreased the objective more per factorisation
 when last used. Costs are counted, not measured by a clock: in groups of L-BFGS iterations, from the numbers of springs,
@@ -472,6 +472,7 @@ class MeasuredRule(ShiftScheduleRule):
 
     Attributes:
         agrees_with_model: whether the Hessian of the last step was unmodified and its decrease agreed with the model.
+        decrement_ratio: ratio of the squared Newton decrements g'H^-1 g after and before a step that agreed.
         is_exact_only: whether only the unmodified Hessian may be factorised.
     """
 
@@ -487,6 +488,7 @@ class MeasuredRule(ShiftScheduleRule):
         self._gains = {"shift": np.inf, "schedule": np.inf}  # [J] per factorisation, when last used
         self._name = "shift"
         self.agrees_with_model = self.is_exact_only = False
+        self.decrement_ratio = 0.0
 
     def factorise_hessian(self, hessian: Hessian, at: DescentPoint, diagonal: NDArray[np.float64]) -> int | None:
         """Factorise the exact Hessian or, unless `is_exact_only`, a shifted one.
@@ -535,6 +537,8 @@ class MeasuredRule(ShiftScheduleRule):
         if self._level:
             self._gains[self._name] = fall / (self._factor.num_factorisations - self._before)
         self.agrees_with_model = self._level == 0 and (fall == 0.0 or low * slope <= fall <= high * slope)
+        if self.agrees_with_model and slope > 0.0:
+            self.decrement_ratio = inner_product(to.gradient, hessian.solve(to.gradient)) / slope
 
 
 class HybridIteration:
@@ -753,6 +757,8 @@ class MethodChoice:
                     self._name = name
                     self._recent_steps.clear()
                 self._control.begin_phase(name)
+                if name != "newton" and self._measured_rule is not None:
+                    self._measured_rule.agrees_with_model = False  # it compared an earlier point
                 if name == "lbfgs":
                     point = self._run_lbfgs()
                 else:
@@ -778,8 +784,19 @@ class MethodChoice:
         """Whether the last step of the exact method agreed with its quadratic model."""
         return self._measured_rule is not None and self._measured_rule.agrees_with_model
 
+    @property
+    def _converges_faster(self) -> bool:
+        """Whether the last exact step agreed with its model and reduced the error per cost by more than L-BFGS did.
+
+        The error is the squared Newton decrement, and for L-BFGS the decrease of a group.
+        """
+        if not self._agrees_with_model:
+            return False
+        ratio, other = self._rule.decrement_ratio, float(self._rounds["gain_ratio"][0])
+        return not 0.0 < other < 1.0 or ratio <= other**self._method.newton_cost
+
     def _choose_method(self) -> str:
-        if self._agrees_with_model or self._is_trial_due or not any(self._gains.values()):
+        if self._converges_faster or self._is_trial_due or not any(self._gains.values()):
             return "newton"
         if self._gains["lbfgs"] == np.inf:
             return "lbfgs"
@@ -791,7 +808,7 @@ class MethodChoice:
         if self._run is None:
             self._run = self._method.start_lbfgs(step, self._point.positions)
             rounds["group_start"], rounds["group_end"] = 0.0, rounds["num_iterations"] + GROUP_ITERATIONS
-            rounds["gain"], rounds["group_residual"] = np.inf, 0.0
+            rounds["gain"], rounds["gain_ratio"], rounds["group_residual"] = np.inf, 1.0, 0.0
             rounds["segment_end"], rounds["is_sweeping"] = rounds["group_end"], 0
             rounds["round_decrease"] = 0.0
         if step.barrier_energies:  # each round is checked for collisions
@@ -874,7 +891,7 @@ class MethodChoice:
             self._gains[name] = total_fall / total_cost if total_cost > 0.0 else 0.0
         if name == "newton":
             others = self._fallen / self._spent if self._spent > 0.0 else 0.0
-            is_better = self._agrees_with_model or self._gains["newton"] > others
+            is_better = self._converges_faster or self._gains["newton"] > others
             self._patience = _FIRST_PATIENCE if is_better else 2.0 * self._patience
             self._is_trial_due, self._spent, self._fallen = False, 0.0, 0.0
             rounds = self._rounds
