@@ -463,3 +463,17 @@ def test_the_decrement_ratio_is_that_of_the_hessian_before_the_step():
     after, before = (np.sum(g * hessian.solve(g)) for g in (to.gradient, at.gradient))
     assert rule.decrement_ratio == pytest.approx(after / before, rel=1e-6)
     assert 0.0 < rule.decrement_ratio < 0.1
+
+
+@pytest.mark.parametrize(("ratio", "is_very_stiff"), [(1e3, False), (1e12, True)])
+def test_a_very_stiff_system_takes_gradients_from_the_objective(ratio, is_very_stiff):
+    given = stiff(ratio)
+    prepared = HybridNewton().prepare(given.system)
+    assert isinstance(prepared, PreparedHybrid)
+    method, step = prepared.method, StepObjective(prepared.fixed_objective, given)
+    assert method.is_very_stiff == is_very_stiff
+    assert (method.exact_lbfgs is None) == is_very_stiff
+    run = method.start_lbfgs(step, given.initial_guess)
+    run.step_state()
+    wanted = step.gradient(run.positions) if is_very_stiff else run.gradient()
+    np.testing.assert_array_equal(method.read_point(step, run).gradient, wanted)

@@ -133,9 +133,10 @@ _LBFGS_NANOSECONDS, _SWEEP_NANOSECONDS, _NEWTON_NANOSECONDS = (7e2, 26.0, 1.2), 
 of a Newton step (constant, per flop, per entry), fitted to 31 scenes of 6 to 16384 vertices on one core with AVX-512;
 their ratio alone matters."""
 
-_MAX_SWEEP_RATIO = float(np.finfo(np.float64).eps) ** -0.5
-"""Largest ratio of the diagonal of Q to the inertia at which there are sweeps: beyond it the rounding of positions
-changes the elastic energy by more than the sweeps decrease the objective."""
+_MAX_EXACT_RATIO = _MAX_SWEEP_RATIO = float(np.finfo(np.float64).eps) ** -0.5
+"""Largest ratio of the diagonal of Q to the inertia at which the gradients of L-BFGS are used, and at which there are
+sweeps: beyond it the rounding of positions changes the elastic energy by more than the sweeps decrease the objective,
+and a residual of 1e-6 is round-off of the kernels of L-BFGS."""
 
 _SWEEP_FIRST_RATIO = 500.0
 """Largest ratio of the diagonal of Q to the inertia at which a solve starts with sweeps: Chebyshev's iteration then
@@ -551,6 +552,7 @@ class HybridIteration:
         newton: the exact method.
         factor: factor of the Hessian.
         exact_lbfgs: L-BFGS, if its residuals are those of the metric; else None.
+        is_very_stiff: whether the gradients of L-BFGS have too much round-off (`_MAX_EXACT_RATIO`).
         starts_lower: whether L-BFGS itself starts at the lower one of the initial guess and the inertial prediction.
         newton_cost: cost of a Newton step, in groups of L-BFGS iterations.
         sweep_cost: cost of a round of sweeps, in L-BFGS iterations; 0 if there are none.
@@ -569,7 +571,8 @@ class HybridIteration:
         self.inertia_diagonal: NDArray[np.float64] = np.repeat(inertia, 3)
         self.factor = factor = objective.hessian_matrix.factor
         self._system_has_barriers = without_barriers(objective.system) is not objective.system
-        is_exact = is_double and not objective.has_barriers
+        self.is_very_stiff = bool((metric.free_diagonal > _MAX_EXACT_RATIO * inertia).any())
+        is_exact = is_double and not self.is_very_stiff and not objective.has_barriers
         is_exact = is_exact and objective.system is without_vertex_contact(objective.system)
         self.exact_lbfgs = lbfgs if is_exact else None
         is_projective = objective.projective_indices.issuperset(objective.element_energy_indices)
@@ -704,7 +707,17 @@ class HybridIteration:
         """
         run = self.start_lbfgs(step, p)
         run.run_iterations(LoopLimits(_RELAXATION_ITERATIONS, 0.0, 0.0, RESIDUAL_NEVER))
-        return compute_current_point(run)
+        return self.read_point(step, run)
+
+    def read_point(self, step: StepObjective, run: AcceleratedState) -> DescentPoint:
+        """Return the current point of L-BFGS with its gradient, which is that of `step` if `is_very_stiff`.
+
+        Args:
+            step: objective of the step.
+            run: state of L-BFGS.
+        """
+        positions = run.positions.copy()
+        return DescentPoint(positions, step.gradient(positions) if self.is_very_stiff else run.gradient())
 
 
 class MethodChoice:
@@ -822,7 +835,7 @@ class MethodChoice:
         if self._method.exact_lbfgs and not isnan(residual):
             point, self._control.residual = DescentPoint(self._run.positions.copy(), NO_GRADIENT), residual
         else:
-            point = compute_current_point(self._run)
+            point = self._method.read_point(step, self._run)
         self.record_rounds(residual, ended)
         return point
 
@@ -905,7 +918,7 @@ class MethodChoice:
         """Return a lower point next to the current saddle point, or None."""
         self._control.must_escape = False
         step, diagonal = self._step, self._method.system_diagonal
-        at = compute_current_point(self._run) if self._run is not None else self._point
+        at = self._method.read_point(step, self._run) if self._run is not None else self._point
         hessian = step.hessian(at.positions)
         if not hessian.factorise(0.0):
             return None
@@ -921,8 +934,3 @@ def _is_collision_free(step: StepObjective, before: Positions, after: Positions)
     if not step.barrier_energies:
         return True
     return step.max_step_size(before, after - before) == 1.0 and not has_active_barrier(step, after)
-
-
-def compute_current_point(run: AcceleratedState) -> DescentPoint:
-    """Return the current point of L-BFGS, with its gradient."""
-    return DescentPoint(run.positions.copy(), run.gradient())
