@@ -55,7 +55,8 @@ LIMITS = (1.25, 1.6)
 MIN_COUNTED_SECONDS = 2e-4
 """Time of the fastest method [s], above which an accuracy is included in these numbers."""
 MAX_FIRST_PASS_RATIO = 3.0
-"""A method is timed if its first-pass time is within this multiple of the least, for at least one accuracy."""
+"""A method is timed if its first-pass time is within this multiple of the least of the other methods, for at least one
+accuracy."""
 CONVERGED = StopRule(3000, rtol=1e-9)
 """End of the solve that finds the minimum to which a method converges."""
 NUM_RESAMPLES, CONFIDENCE = 2000, 0.95
@@ -243,7 +244,8 @@ def measure_step(
         problem = step.step_snapshot.build_problem(guess)
         compute_measure = None if measure == "own-gap" else build_measure(step, problem, measure)
         candidates = [found for spec in specs if (found := build_candidate(spec, problem, compute_measure, targets))]
-        least = {t: min((one.seconds[t] for one in candidates if t in one.seconds), default=np.inf) for t in targets}
+        others = [one for one in candidates if one.name != name]
+        least = {t: min((one.seconds[t] for one in others if t in one.seconds), default=np.inf) for t in targets}
         timed = [
             one
             for one in candidates

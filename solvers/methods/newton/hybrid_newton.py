@@ -668,7 +668,9 @@ class HybridIteration:
         return self._lbfgs.init_state(self._without_barriers(step.problem), p)
 
     def prepare_lower_start(self, problem: StepProblem, guess: Positions) -> LbfgsSweepState:
-        """Prepare a start of L-BFGS at the lower one of the guess and the inertial prediction, if `starts_lower`.
+        """Prepare L-BFGS, if `starts_lower`.
+
+        It starts at the lower one of the guess and the inertial prediction.
 
         Args:
             problem: step whose objective is minimised.
@@ -710,7 +712,9 @@ class HybridIteration:
         return self.read_point(step, run)
 
     def read_point(self, step: StepObjective, run: AcceleratedState) -> DescentPoint:
-        """Return the current point of L-BFGS with its gradient, which is that of `step` if `is_very_stiff`.
+        """Return the current point of L-BFGS.
+
+        Its gradient is that of L-BFGS or, if `is_very_stiff`, of the objective.
 
         Args:
             step: objective of the step.
@@ -799,9 +803,9 @@ class MethodChoice:
 
     @property
     def _converges_faster(self) -> bool:
-        """Whether the last exact step agreed with its model and reduced the error per cost by more than L-BFGS did.
+        """Whether the last exact step agreed with its model and converged faster than L-BFGS did.
 
-        The error is the squared Newton decrement, and for L-BFGS the decrease of a group.
+        Errors are compared per cost. The error is the squared Newton decrement, and for L-BFGS the decrease of a group.
         """
         if not self._agrees_with_model:
             return False

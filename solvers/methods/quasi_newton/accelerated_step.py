@@ -78,7 +78,7 @@ def start_solve(step: AcceleratedStep, window: AccelerationWindow, target, force
 
 @jit_inner
 def start_lower_solve(step, window, target, force, pin_targets, guess, external_force, measures_guess, out):
-    """Start the solve of a step at the lower one of a guess and the inertial prediction.
+    """Start the solve at the lower of a guess and the inertial prediction.
 
     Args:
         step: data of the system; its vectors and objective values are overwritten.

@@ -57,7 +57,9 @@ class LbfgsSweepEngine(CompiledEngine):
         return LbfgsSweepState(self, problem, initial_guess).start_at_guess()
 
     def init_lower_state(self, problem: StepProblem, initial_guess: Positions) -> LbfgsSweepState:
-        """Prepare a solve whose first rounds start it at the lower one of a guess and the inertial prediction.
+        """Prepare a solve, which its first rounds start.
+
+        It starts at the lower one of a guess and the inertial prediction.
 
         Args:
             problem: step whose objective is minimised.
@@ -112,7 +114,7 @@ class LbfgsSweepState(CompiledAccelerationState):
         return self._start_lower(rounds, STARTS_MEASURED)
 
     def _start_lower(self, rounds: NDArray[Any], start: int) -> float:
-        """Start the solve without rounds; return the residual at the guess [J^(1/2)], NaN if it is not measured."""
+        """Start the solve without rounds; return the residual at the guess [J^(1/2)] or NaN."""
         self._start_kind = CONTINUES
         residual = self._round_kernel.call(*self._round_arguments, start, self._trace, rounds, NO_ITERATIONS)[3]
         self._add_energy_scales(self.start_positions)

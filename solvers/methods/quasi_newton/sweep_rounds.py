@@ -96,7 +96,10 @@ def _window_residual(state):
 
 @jit_inner
 def _estimate_residual(state):
-    """Return the square root of grad g' Q^-1 grad g, which includes pinned vertices: nan if there are such unknowns."""
+    """Return the square root of grad g' Q^-1 grad g.
+
+    It includes pinned vertices; if any of them are unknowns, it is nan.
+    """
     step, window, _, _ = state
     for q in range(len(step.vertex_rows.pin_weight)):
         if step.vertex_rows.pin_weight[q] < np.inf:
