@@ -130,7 +130,6 @@ def _assess_round(now, decrease, residual, residual_limit):
 def build_rounds(
     run_unchecked: Callable[..., Any],
     residual: Callable[..., Any],
-    estimated_residual: Callable[..., Any],
     decrease: Callable[..., Any],
     sweep: Callable[..., Any],
 ) -> Callable[..., Any]:
@@ -138,9 +137,8 @@ def build_rounds(
 
     Args:
         run_unchecked: function of the state and a number of iterations that does them and returns how many succeeded.
-        residual: function of the state that returns the residual [J^(1/2)].
-        estimated_residual: function of the state that returns it up to round-off, or nan. It is used unless it is
-            within a factor of two of a limit.
+        residual: function of the state and a residual r that returns the residual [J^(1/2)]; above r it may be an
+            estimate.
         decrease: function of the state that returns the decrease of the objective since the start [J].
         sweep: function of the state that does a round of sweeps.
 
@@ -154,14 +152,12 @@ def build_rounds(
     def iterate(state: Any, rounds: Any, limits: Any) -> Any:
         now, count, found, ended = rounds[0], 0, np.nan, REASON_ITERATIONS
         if limits.max_iterations == 0:
-            return 0, residual(state), REASON_ITERATIONS
+            return 0, residual(state, np.inf), REASON_ITERATIONS
         floor = max(limits.residual_floor, now.residual_floor)
         limits = LoopLimits(limits.max_iterations, limits.residual_limit, floor, limits.residual_mode)
-        near_limit = 2.0 * max(limits.residual_limit, floor)
+        exact_below = 2.0 * max(limits.residual_limit, floor)
         if now.initial_residual < 0.0:
-            found = estimated_residual(state)
-            found = found if found > near_limit else residual(state)
-            now.initial_residual = now.group_residual = now.segment_residual = found
+            now.initial_residual = now.group_residual = now.segment_residual = residual(state, exact_below)
         while ended == REASON_ITERATIONS and count < limits.max_iterations:
             count += 1
             size = now.sweep_cost if now.is_sweeping == 1 else round_size(now)
@@ -176,8 +172,7 @@ def build_rounds(
             is_assessed = now.num_iterations == PROBE_ITERATIONS or now.num_iterations >= now.group_end
             found = np.nan
             if limits.residual_limit > 0.0 or ends_segment or is_assessed or not is_done:
-                found = estimated_residual(state)
-                found = found if found > near_limit else residual(state)
+                found = residual(state, exact_below)
                 ended = check_residual(found, limits)
             if ends_segment:
                 _choose_sweeps(now, total, found)
@@ -192,7 +187,6 @@ def build_rounds(
 def build_compiled_rounds(
     step_state: Callable[..., Any],
     residual: Callable[..., Any],
-    estimated_residual: Callable[..., Any],
     decrease: Callable[..., Any],
     sweep: Callable[..., Any],
 ) -> Any:
@@ -200,8 +194,7 @@ def build_compiled_rounds(
 
     Args:
         step_state: does an iteration and returns whether it succeeded.
-        residual: returns the residual [J^(1/2)].
-        estimated_residual: returns it up to round-off, or nan.
+        residual: returns the residual [J^(1/2)]; it takes a second argument, as in `build_rounds`.
         decrease: returns the decrease of the objective since the start [J].
         sweep: does a round of sweeps.
 
@@ -209,7 +202,7 @@ def build_compiled_rounds(
         The function of `build_rounds`, compiled.
     """
 
-    return jit_closure(build_rounds(build_unchecked_steps(step_state), residual, estimated_residual, decrease, sweep))
+    return jit_closure(build_rounds(build_unchecked_steps(step_state), residual, decrease, sweep))
 
 
 def init_rounds(newton_cost: float, check_cost: float, sweep_cost: int = 0, *, starts_sweeping: bool = False) -> Any:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from dataclasses import dataclass
-from operator import attrgetter, methodcaller
+from operator import attrgetter
 from typing import Any, Protocol
 
 import numpy as np
@@ -70,8 +70,7 @@ class AcceleratedState(SolverState):
 
 _interpreted_rounds = descent_rounds.build_rounds(
     lambda state, count: state.run_unchecked(count),
-    methodcaller("residual"),
-    lambda state: np.nan,
+    lambda state, exact_below: state.residual(),
     attrgetter("objective_decrease"),
     lambda state: None,
 )

@@ -89,22 +89,26 @@ def _step_window(state):
 
 
 @jit_inner
-def _window_residual(state):
+def _window_residual(state, exact_below):
+    """Return the residual [J^(1/2)].
+
+    Above `exact_below` it is the square root of grad g' Q^-1 grad g, which is known. That includes pinned vertices, and
+    is not used if any of them are unknowns.
+    """
     step, window, _, _ = state
-    return compute_window_residual((step, window))
+    estimate = np.sqrt(window.window_state[0].correction_squarednorm)
+    for q in range(len(step.vertex_rows.pin_weight)):
+        if step.vertex_rows.pin_weight[q] < np.inf:
+            estimate = np.nan
+    return estimate if estimate > exact_below else compute_window_residual((step, window))
 
 
 @jit_inner
-def _estimate_residual(state):
-    """Return the square root of grad g' Q^-1 grad g.
-
-    It includes pinned vertices; if any of them are unknowns, it is nan.
-    """
-    step, window, _, _ = state
-    for q in range(len(step.vertex_rows.pin_weight)):
-        if step.vertex_rows.pin_weight[q] < np.inf:
-            return np.nan
-    return np.sqrt(window.window_state[0].correction_squarednorm)
+def _copy_vertices(x, row_of_vertex, out, row_in_out):
+    """Copy the coordinates of all vertices between vectors with other rows."""
+    for v in range(len(row_of_vertex)):
+        for c in range(3):
+            out[4 * row_in_out[v] + c] = x[4 * row_of_vertex[v] + c]
 
 
 @jit_inner
@@ -120,21 +124,17 @@ def _sweep_vertices(state):
     """
     step, window, sweeps, arrays = state
     packets, rows, right, scratch = sweeps.sweep_memory
-    source, destination = sweeps.vertex_rows.row_of_vertex, step.vertex_rows.row_of_vertex
+    sweep_row, window_row = sweeps.vertex_rows.row_of_vertex, step.vertex_rows.row_of_vertex
     if scratch.omega[0] == NOT_STARTED:
         read_positions(step.vertex_rows, window.position, arrays.positions)
         start_sweeps(
             sweeps.vertex_rows, arrays.target, arrays.force, arrays.pin_targets, arrays.positions, right, scratch, rows
         )
     elif scratch.omega[0] == MOVED:
-        for v in range(len(source)):
-            for c in range(3):
-                rows[4 * source[v] + c] = window.position[4 * destination[v] + c]
+        _copy_vertices(window.position, window_row, rows, sweep_row)
         restart_sweeps(scratch, rows)
     run_unchecked_sweeps(packets, right, sweeps.spectral_radius, scratch, rows, ROUND_SWEEPS)
-    for v in range(len(source)):
-        for c in range(3):
-            window.trial_position[4 * destination[v] + c] = rows[4 * source[v] + c]
+    _copy_vertices(rows, sweep_row, window.trial_position, window_row)
     if not _accept_lower_trial(step, window):
         scratch.omega[0] = MOVED
 
@@ -162,9 +162,7 @@ def _accept_lower_trial(step, window):
     return True
 
 
-_iterate_rounds = build_compiled_rounds(
-    _step_window, _window_residual, _estimate_residual, _window_decrease, _sweep_vertices
-)
+_iterate_rounds = build_compiled_rounds(_step_window, _window_residual, _window_decrease, _sweep_vertices)
 
 
 @jit_kernel
