@@ -4,13 +4,14 @@ After each group of iterations, rounds of sweeps of another first-order method m
 
     q = D_k / D_(k-1),   remaining decrease = q D_k + q^2 D_k + ... = D_k q / (1 - q)
     switch if that per cost of Newton's method exceeds q D_k per round, i.e. if  1 / (1 - q) > cost of two Newton steps
-    unless  log(r_k / limit) / log(r_(k-1) / r_k) <= cost of a Newton step
+    unless  q >= 1  or  log(r_k / limit) / log(r_(k-1) / r_k) <= cost of a Newton step
 
 D_k is the decrease of the objective in the k-th group of rounds, and r_k the residual after it: no switch pays if the
-rounds reach the limit of the residual within the cost of one Newton step. Newton's method is assumed to need two steps,
-one of which leads to where the other converges. Costs are counted in groups, from the numbers of entries and
-operations, and not measured by a clock: equal solves then make equal decisions. Once a Newton step has been measured,
-its decrease per cost replaces the prediction.
+rounds reach the limit of the residual within the cost of one Newton step. Growing decreases indicate that the objective
+is not convex here, where Newton's method gains little. It is assumed to need two steps, one of which leads to where the
+other converges. Costs are counted in groups, from the numbers of entries and operations, and not measured by a clock:
+equal solves then make equal decisions. Once a Newton step has been measured, its decrease per cost replaces the
+prediction.
 
 A round ends with a check, which costs c iterations. Rounds of s iterations cost c/s per iteration, and the last one
 makes s/2 iterations superfluous. With n iterations, n c/s + s/2 is minimal for s = sqrt(2 c n). Rounds have twice that
@@ -45,9 +46,9 @@ PROBE_ITERATIONS = 4
 _FAST_RESIDUAL_RATIO = 0.5
 """Largest ratio of residuals after the very first iterations at which the method is considered suitable."""
 
-_NEAR_FRACTION = 0.01
-"""Largest decrease in a round, as a fraction of that since the start, at which sweeps may follow: far from a minimum
-they lead to other, higher minima more often."""
+_NEAR_FRACTION = 5e-5
+"""Largest decrease per iteration, as a fraction of that since the start, at which sweeps may follow L-BFGS: far from a
+minimum they lead to other, higher minima more often."""
 
 _SWEEP_RESIDUAL_RATIO = 10.0**-0.25
 """Largest ratio of residuals at which more sweeps follow: that of a tenth of the objective in two rounds."""
@@ -90,12 +91,12 @@ def round_size(now):
 
 
 @register_jitable(**jit_inner_options)
-def _choose_sweeps(now, decrease, residual):
-    """Decide whether the next round consists of sweeps."""
+def _choose_sweeps(now, decrease, residual, size):
+    """Decide whether the next round consists of sweeps, after one of `size` iterations."""
     if now.is_sweeping == 1:
         continues = residual < _SWEEP_RESIDUAL_RATIO * now.segment_residual
     else:
-        continues = decrease - now.round_decrease <= _NEAR_FRACTION * decrease
+        continues = decrease - now.round_decrease <= _NEAR_FRACTION * size * decrease
     now.is_sweeping = 1 if continues else 0
     now.segment_end, now.segment_residual = now.num_iterations + GROUP_ITERATIONS, residual
 
@@ -122,7 +123,7 @@ def _assess_round(now, decrease, residual, residual_limit):
             return REASON_ITERATIONS
     if gain <= 0.0 or gain < now.rival_gain:
         return REASON_SWITCH
-    if now.num_iterations < now.trial_iteration:
+    if now.num_iterations < now.trial_iteration or gain >= before:
         return REASON_ITERATIONS
     return REASON_SWITCH if _NEWTON_STEPS * now.newton_cost * (before - gain) < before else REASON_ITERATIONS
 
@@ -175,7 +176,7 @@ def build_rounds(
                 found = residual(state, exact_below)
                 ended = check_residual(found, limits)
             if ends_segment:
-                _choose_sweeps(now, total, found)
+                _choose_sweeps(now, total, found, size)
             now.round_decrease = total
             if ended == REASON_ITERATIONS:
                 ended = _assess_round(now, total, found, limits.residual_limit) if is_done else REASON_STALLED

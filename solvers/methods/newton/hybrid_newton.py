@@ -15,11 +15,11 @@ Sorensen 1983).
 
 L-BFGS runs first. If the factor of Q exceeds the cache, it is in float32, unless Q is so stiff that its directions
 would have no digit: the iterations are then limited by memory bandwidth, and directions need no more digits. The start
-is the better of the initial guess and the inertial prediction. Near the minimum, where a round of L-BFGS decreases the
-objective by at most a hundredth of the decrease so far, groups of its iterations alternate with rounds of sweeps of
-vertex block descent (`springbench.solvers.methods.quasi_newton.sweep_rounds`). More rounds of sweeps follow as long as
-each reduces the residual to 0.56 of it. The sweeps come first if no diagonal entry of Q exceeds 500 times the inertia;
-there are none if one exceeds the inertia over the square root of the machine epsilon.
+is the better of the initial guess and the inertial prediction. Near the minimum, where an
+iteration of L-BFGS decreases the objective by at most 5e-5 of the decrease so far, groups of its iterations alternate
+with rounds of sweeps of vertex block descent (`springbench.solvers.methods.quasi_newton.sweep_rounds`). More rounds of
+sweeps follow as long as each reduces the residual to 0.56 of it. The sweeps come first if no diagonal entry of Q exceeds
+500 times the inertia; there are none if one exceeds the inertia over the square root of the machine epsilon.
 
 One rule decides which of the three methods continues: that with the largest decrease of the objective per cost in its
 last steps. A method that was not yet measured is credited with the decrease that L-BFGS leaves, extrapolated from its
