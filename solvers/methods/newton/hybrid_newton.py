@@ -18,8 +18,8 @@ would have no digit: the iterations are then limited by memory bandwidth, and di
 is the better of the initial guess and the inertial prediction. Near the minimum, where an
 iteration of L-BFGS decreases the objective by at most 5e-5 of the decrease so far, groups of its iterations alternate
 with rounds of sweeps of vertex block descent (`springbench.solvers.methods.quasi_newton.sweep_rounds`). More rounds of
-sweeps follow as long as each reduces the residual to 0.56 of it. The sweeps come first if no diagonal entry of Q exceeds
-500 times the inertia; there are none if one exceeds the inertia over the square root of the machine epsilon.
+sweeps follow as long as each reduces the residual to 0.56 of it. The sweeps come first if no diagonal entry of Q
+exceeds 500 times the inertia; there are none if one exceeds the inertia over the square root of the machine epsilon.
 
 One rule decides which of the three methods continues: that with the largest decrease of the objective per cost in its
 last steps. A method that was not yet measured is credited with the decrease that L-BFGS leaves, extrapolated from its
@@ -389,11 +389,12 @@ class LbfgsFirstState(HybridState):
 
     def _start_points(self) -> None:
         """Begin the phase of L-BFGS, whose first round starts the solve."""
+        self._is_exact = self._prepared.method.exact_lbfgs is not None
         self._control.begin_phase("lbfgs")
 
-    def compute_start_residual(self) -> float:
-        """Start L-BFGS and return the residual [J^(1/2)] at the initial guess."""
-        return self._prepare_run().start_lower(self._rounds)
+    def compute_start_residual(self) -> float | None:
+        """Start L-BFGS and return the residual [J^(1/2)] at the initial guess, if its residuals are exact."""
+        return self._prepare_run().start_lower(self._rounds) if self._is_exact else None
 
     def _prepare_run(self) -> LbfgsSweepState:
         """Prepare L-BFGS, which the first rounds start."""
@@ -419,7 +420,7 @@ class LbfgsFirstState(HybridState):
         if limits is not self._limits:
             self._limits, self._round_limits = limits, limit_rounds(limits)
         count, residual, ended = run.run_rounds(self._rounds, self._round_limits)
-        control.num_iterations, control.residual = count, None if isnan(residual) else residual
+        control.num_iterations, control.residual = count, residual if self._is_exact and not isnan(residual) else None
         self._num_rounds += count
         self.positions = run.positions
         if ended != REASON_ITERATIONS and self._is_lbfgs_done(residual, ended):
@@ -433,7 +434,11 @@ class LbfgsFirstState(HybridState):
     def residual(self) -> float:
         """Return the residual [J^(1/2)] at the current positions."""
         if self._run is not None and self._control.residual is None:
-            self._control.residual = self._run.run_rounds(self._rounds, NO_ITERATIONS)[1]
+            self._control.residual = (
+                self._run.run_rounds(self._rounds, NO_ITERATIONS)[1]
+                if self._is_exact
+                else self._prepared.metric.residual(self._run.gradient())
+            )
         return super().residual()
 
     def _end_lbfgs_alone(self, run: LbfgsSweepState, residual: float, ended: int) -> None:
@@ -572,13 +577,13 @@ class HybridIteration:
         self.factor = factor = objective.hessian_matrix.factor
         self._system_has_barriers = without_barriers(objective.system) is not objective.system
         self.is_very_stiff = bool((metric.free_diagonal > _MAX_EXACT_RATIO * inertia).any())
-        is_exact = is_double and not self.is_very_stiff and not objective.has_barriers
-        is_exact = is_exact and objective.system is without_vertex_contact(objective.system)
-        self.exact_lbfgs = lbfgs if is_exact else None
+        is_alone = not self.is_very_stiff and not objective.has_barriers
+        is_alone = is_alone and objective.system is without_vertex_contact(objective.system)
+        self.exact_lbfgs = lbfgs if is_alone and is_double else None
         is_projective = objective.projective_indices.issuperset(objective.element_energy_indices)
         engine = lbfgs.acceleration_engine
         self._sweep_engine = engine if isinstance(engine, LbfgsSweepEngine) else None
-        self.starts_lower = is_exact and is_projective and self._sweep_engine is not None
+        self.starts_lower = is_alone and is_projective and self._sweep_engine is not None
         springs, entries = len(objective.springs.stiffness), lbfgs.stats.get("nnz_factor", 0.0)
         constant, per_vertex, per_entry = _LBFGS_NANOSECONDS
         lbfgs_cost = constant + per_vertex * objective.system.num_vertices + per_entry * entries
@@ -760,6 +765,7 @@ class MethodChoice:
         self._predicting: PredictedTensionNewton | None = None
         self._gains = {"lbfgs": np.inf, "predicted tensions": 0.0, "newton": 0.0}  # [J] per cost of a group
         self._name = ""
+        self._was_indefinite = False
         self._recent_steps: deque[tuple[float, float]] = deque(maxlen=_MEASURED_STEPS)  # [J], cost
         self._is_trial_due, self._patience, self._spent, self._fallen = False, _FIRST_PATIENCE, 0.0, 0.0
         self._trial_cost = _FIRST_PATIENCE * method.newton_cost  # spent by the others until the exact method is tried
@@ -872,7 +878,10 @@ class MethodChoice:
         self._rule.is_exact_only = self._predicting is None and any(self._gains.values())
         point, self._steepest = self._method.newton.next_point(self._step, self._point, self._steepest, self._rule)
         if point.is_stalled and self._rule.is_exact_only:
-            self._gains["predicted tensions"] = np.inf
+            if self._was_indefinite:
+                self._gains["predicted tensions"] = np.inf
+            else:
+                self._was_indefinite, self._patience = True, 0.5 * self._patience
             return self._point
         return point
 
