@@ -18,11 +18,18 @@ from springbench.solvers.iteration.descent_method import DescentPoint, ResidualM
 from springbench.solvers.iteration.phase_clock import measure_phases
 from springbench.solvers.kernels import descent_rounds
 from springbench.solvers.kernels.descent_rounds import REASON_SWITCH
-from springbench.solvers.kernels.iteration_loop import REASON_ITERATIONS
+from springbench.solvers.kernels.iteration_loop import REASON_ITERATIONS, RESIDUAL_NEVER, LoopLimits
 from springbench.solvers.linalg.cholesky import symbolic_factorisation
 from springbench.solvers.linalg.cholesky.block_cholesky import BlockCholesky
 from springbench.solvers.methods.newton import hybrid_newton
-from springbench.solvers.methods.newton.hybrid_newton import HybridNewton, MeasuredRule, PreparedHybrid
+from springbench.solvers.methods.newton.hybrid_newton import (
+    HybridNewton,
+    LbfgsFirstState,
+    MeasuredRule,
+    MethodChoice,
+    PreparedHybrid,
+    SolveControl,
+)
 from springbench.solvers.methods.newton.inertia_shift import InertiaShift
 from springbench.solvers.methods.newton.negative_curvature import probe_negative_curvature
 from springbench.solvers.methods.newton.newton_direct import NewtonIteration, NewtonSolver
@@ -173,26 +180,60 @@ def build_rounds_at(**fields):
     return rounds
 
 
-@pytest.mark.parametrize(("last_decrease", "follow"), [(0.011, 0), (0.009, 1)])
+@pytest.mark.parametrize(("last_decrease", "follow"), [(1.1e-4, 0), (0.9e-4, 1)])
 def test_sweeps_follow_iterations_near_the_minimum_only(last_decrease, follow):
+    """A round of two iterations decreases the objective by at most 1e-4 of the decrease so far."""
     rounds = build_rounds_at(round_decrease=1.0 - last_decrease)
-    descent_rounds._choose_sweeps(rounds, 1.0, 0.5)
+    descent_rounds._choose_sweeps(rounds, 1.0, 0.5, 2)
     assert rounds.is_sweeping == follow
 
 
 @pytest.mark.parametrize(("residual", "follow"), [(0.57, 0), (0.56, 1)])
 def test_more_sweeps_follow_if_two_rounds_reduce_the_objective_to_a_tenth(residual, follow):
     rounds = build_rounds_at(is_sweeping=1, round_decrease=0.0)
-    descent_rounds._choose_sweeps(rounds, 1.0, residual)
+    descent_rounds._choose_sweeps(rounds, 1.0, residual, 3)
     assert rounds.is_sweeping == follow
     assert rounds.segment_end == rounds.num_iterations + descent_rounds.GROUP_ITERATIONS
 
 
-def test_sweeps_help_lbfgs_where_springs_are_compressed(monkeypatch):
-    """A cloth whose edges are moved together by a tenth: a gap of 1e-6 takes fewer iterations and sweeps."""
-    given = stiff(1e3)
+def squeeze_cloth(ratio: float) -> StepProblem:
+    """A cloth whose edges are moved together by a tenth: its Hessian is indefinite."""
+    given = stiff(ratio)
     squeezed = given.current_positions * [0.9, 1.0, 1.0]
-    given = replace(given, initial_guess=squeezed, inertial_target=squeezed, external_force=given.external_force / 10.0)
+    return replace(given, initial_guess=squeezed, inertial_target=squeezed, external_force=given.external_force / 10.0)
+
+
+def test_predicted_tensions_follow_the_second_hessian_without_a_factor():
+    given = squeeze_cloth(1e3)
+    prepared = HybridNewton().prepare(given.system)
+    assert isinstance(prepared, PreparedHybrid)
+    method, step = prepared.method, StepObjective(prepared.fixed_objective, given)
+    run = method.start_lbfgs(step, given.initial_guess)
+    choice = MethodChoice(method, step, given.initial_guess, run, SolveControl(), method.init_rounds())
+    patience = choice._patience
+    assert choice._take_newton_step().positions is given.initial_guess
+    assert (choice._gains["predicted tensions"], choice._patience) == (0.0, 0.5 * patience)
+    choice._take_newton_step()
+    assert (choice._gains["predicted tensions"], choice._patience) == (np.inf, 0.5 * patience)
+
+
+def test_a_solve_in_float32_starts_compiled_and_reports_residuals_of_the_metric(monkeypatch):
+    given = stiff(1e3)
+    exact = HybridNewton().prepare(given.system)
+    monkeypatch.setattr(hybrid_newton, "_CACHED_ENTRIES", 0)
+    prepared = HybridNewton().prepare(given.system)
+    assert isinstance(prepared, PreparedHybrid)
+    assert prepared.method.exact_lbfgs is None
+    run = prepared.init_state(given, given.initial_guess)
+    assert isinstance(run, LbfgsFirstState)
+    run.run_iterations(LoopLimits(4, 0.0, 0.0, RESIDUAL_NEVER))
+    assert run.residual() == pytest.approx(exact.residual_at(given, run.positions), rel=1e-10)
+    assert not run.solver_phases.keys() - {"lbfgs"}
+
+
+def test_sweeps_help_lbfgs_where_springs_are_compressed(monkeypatch):
+    """A gap of 1e-6 takes fewer iterations and sweeps."""
+    given = squeeze_cloth(1e3)
     lowest = NewtonSolver().prepare(given.system).solve(given, StopRule(300, 1e-10)).positions
     counts = []
     for max_ratio in (hybrid_newton._MAX_SWEEP_RATIO, 0.0):
@@ -437,9 +478,12 @@ def test_newtons_method_continues_if_it_converges_faster_than_lbfgs(agrees, decr
     assert hybrid_newton.MethodChoice._converges_faster.fget(choice) is faster
 
 
-@pytest.mark.parametrize(("gain", "reason"), [(0.74, REASON_ITERATIONS), (0.76, REASON_SWITCH)])
+@pytest.mark.parametrize(
+    ("gain", "reason"),
+    [(0.74, REASON_ITERATIONS), (0.76, REASON_SWITCH), (0.99, REASON_SWITCH), (1.01, REASON_ITERATIONS)],
+)
 def test_lbfgs_ends_if_two_newton_steps_cost_less_than_what_is_left(gain, reason):
-    """1 / (1 - q) exceeds four groups, the cost of two steps, from q = 3/4 on."""
+    """1 / (1 - q) exceeds four groups, the cost of two steps, from q = 3/4 on; growing decreases predict nothing."""
     rounds = build_rounds_at(newton_cost=2.0, gain=1.0, group_start=0.0)
     assert descent_rounds._assess_round(rounds, gain, 1.0, 0.0) == reason
     assert rounds.gain_ratio == gain

@@ -15,20 +15,20 @@ Sorensen 1983).
 
 L-BFGS runs first. If the factor of Q exceeds the cache, it is in float32, unless Q is so stiff that its directions
 would have no digit: the iterations are then limited by memory bandwidth, and directions need no more digits. The start
-is the better of the initial guess and the inertial prediction. Near the minimum, where an
-iteration of L-BFGS decreases the objective by at most 5e-5 of the decrease so far, groups of its iterations alternate
-with rounds of sweeps of vertex block descent (`springbench.solvers.methods.quasi_newton.sweep_rounds`). More rounds of
-sweeps follow as long as each reduces the residual to 0.56 of it. The sweeps come first if no diagonal entry of Q
-exceeds 500 times the inertia; there are none if one exceeds the inertia over the square root of the machine epsilon.
+is the better of the initial guess and the inertial prediction. Near the minimum, where an iteration of L-BFGS decreases
+the objective by at most 5e-5 of the decrease so far, groups of its iterations alternate with rounds of sweeps of vertex
+block descent (`springbench.solvers.methods.quasi_newton.sweep_rounds`). More rounds of sweeps follow as long as each
+reduces the residual to 0.56 of it. The sweeps come first if no diagonal entry of Q exceeds 500 times the inertia; there
+are none if one exceeds the inertia over the square root of the machine epsilon.
 
 One rule decides which of the three methods continues: that with the largest decrease of the objective per cost in its
 last steps. A method that was not yet measured is credited with the decrease that L-BFGS leaves, extrapolated from its
-last two groups of iterations (`springbench.solvers.kernels.descent_rounds`). The exact Hessian is tried first. If it
-has no Cholesky factor, predicted tensions follow, and the exact method is tried again after a cost that doubles with
-each attempt that decreases the objective less than the others did meanwhile. The exact method continues as long as its
-Hessian is unmodified, the decrease agrees with the quadratic model, and the squared Newton decrement g'H^-1 g falls
-faster per cost than the decrease of L-BFGS fell from group to group. An indefinite Hessian gets the smallest
-multiple of inertia that has a factor (`springbench.solvers.methods.newton.inertia_shift`), or loses negative stiffness
+last two groups of iterations (`springbench.solvers.kernels.descent_rounds`). The exact Hessian is tried first. Where it
+had no Cholesky factor twice, predicted tensions follow, and the exact method is tried again after a cost that doubles
+with each attempt that decreases the objective less than the others did meanwhile. The exact method continues as long as
+its Hessian is unmodified, the decrease agrees with the quadratic model, and the squared Newton decrement g'H^-1 g falls
+faster per cost than the decrease of L-BFGS fell from group to group. An indefinite Hessian gets the smallest multiple
+of inertia that has a factor (`springbench.solvers.methods.newton.inertia_shift`), or loses negative stiffness
 (`springbench.solvers.methods.newton.hessian_regularisation`), whichever decreased the objective more per factorisation
 when last used. Costs are counted, not measured by a clock: in groups of L-BFGS iterations, from the numbers of springs,
 entries and operations of the factors and from the factorisations made. So equal solves make equal decisions and have
@@ -873,7 +873,8 @@ class MethodChoice:
     def _take_newton_step(self) -> DescentPoint:
         """Return the point after a step of the exact method.
 
-        If the Hessian has no factor in the first attempt, the current point is returned, and predicted tensions follow.
+        If the exact Hessian has no factor, the current point is returned. Predicted tensions follow from the second
+        time on; the first time, L-BFGS has often not yet reached a convex region, and the next attempt comes sooner.
         """
         self._rule.is_exact_only = self._predicting is None and any(self._gains.values())
         point, self._steepest = self._method.newton.next_point(self._step, self._point, self._steepest, self._rule)
