@@ -874,12 +874,13 @@ class MethodChoice:
         """Return the point after a step of the exact method.
 
         If the exact Hessian has no factor, the current point is returned. Predicted tensions follow from the second
-        time on; the first time, L-BFGS has often not yet reached a convex region, and the next attempt comes sooner.
+        time on, or if L-BFGS has ended. The first time, L-BFGS has often not yet reached a convex region, and the next
+        attempt comes sooner.
         """
         self._rule.is_exact_only = self._predicting is None and any(self._gains.values())
         point, self._steepest = self._method.newton.next_point(self._step, self._point, self._steepest, self._rule)
         if point.is_stalled and self._rule.is_exact_only:
-            if self._was_indefinite:
+            if self._was_indefinite or self._gains["lbfgs"] == 0.0:
                 self._gains["predicted tensions"] = np.inf
             else:
                 self._was_indefinite, self._patience = True, 0.5 * self._patience
