@@ -230,6 +230,11 @@ def test_a_solve_in_float32_starts_compiled_and_reports_residuals_of_the_metric(
     run.run_iterations(LoopLimits(4, 0.0, 0.0, RESIDUAL_NEVER))
     assert run.residual() == pytest.approx(exact.residual_at(given, run.positions), rel=1e-10)
     assert not run.solver_phases.keys() - {"lbfgs"}
+    found = prepared.solve(given, StopRule(300, 1e-12))
+    assert found.termination_reason == "converged"
+    assert found.solver_phases is not None
+    assert "newton" in found.solver_phases
+    assert found.residual == pytest.approx(exact.residual_at(given, found.positions), rel=1e-3)
 
 
 def test_sweeps_help_lbfgs_where_springs_are_compressed(monkeypatch):

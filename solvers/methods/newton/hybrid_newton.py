@@ -445,7 +445,7 @@ class LbfgsFirstState(HybridState):
         """End the phase of L-BFGS alone, and continue with the choice between the methods."""
         method, control = self._prepared.method, self._control
         control.solver_phases, self._is_lbfgs_alone, self._run = self._count_rounds(), False, None
-        self._point = DescentPoint(run.positions.copy(), NO_GRADIENT)
+        self._point = method.read_point(self._step, run)
         self.positions = self._point.positions
         start = run.start_positions
         method_choice = MethodChoice(method, self._step, start, run, control, self._rounds, self._point)
