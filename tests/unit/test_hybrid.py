@@ -203,8 +203,8 @@ def squeeze_cloth(ratio: float) -> StepProblem:
     return replace(given, initial_guess=squeezed, inertial_target=squeezed, external_force=given.external_force / 10.0)
 
 
-@pytest.mark.parametrize(("lbfgs_gain", "refusals"), [(np.inf, 2), (0.0, 1)])
-def test_predicted_tensions_follow_the_second_hessian_without_a_factor(lbfgs_gain, refusals):
+@pytest.mark.parametrize(("lbfgs_gain", "num_attempts"), [(np.inf, 2), (0.0, 1)])
+def test_predicted_tensions_follow_the_second_hessian_without_a_factor(lbfgs_gain, num_attempts):
     """Or the first one, if L-BFGS has ended."""
     given = squeeze_cloth(1e3)
     prepared = HybridNewton().prepare(given.system)
@@ -213,9 +213,9 @@ def test_predicted_tensions_follow_the_second_hessian_without_a_factor(lbfgs_gai
     run = method.start_lbfgs(step, given.initial_guess)
     choice = MethodChoice(method, step, given.initial_guess, run, SolveControl(), method.init_rounds())
     choice._gains |= {"lbfgs": lbfgs_gain, "newton": 1.0}
-    for attempt in range(1, refusals + 1):
+    for attempt in range(1, num_attempts + 1):
         assert choice._take_newton_step().positions is given.initial_guess
-        assert choice._gains["predicted tensions"] == (np.inf if attempt == refusals else 0.0)
+        assert choice._gains["predicted tensions"] == (np.inf if attempt == num_attempts else 0.0)
 
 
 def test_a_solve_in_float32_starts_compiled_and_reports_residuals_of_the_metric(monkeypatch):

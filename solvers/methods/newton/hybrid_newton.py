@@ -23,12 +23,13 @@ are none if one exceeds the inertia over the square root of the machine epsilon.
 
 One rule decides which of the three methods continues: that with the largest decrease of the objective per cost in its
 last steps. A method that was not yet measured is credited with the decrease that L-BFGS leaves, extrapolated from its
-last two groups of iterations (`springbench.solvers.kernels.descent_rounds`). The exact Hessian is tried first. Where it
-had no Cholesky factor twice, predicted tensions follow, and the exact method is tried again after a cost that doubles
-with each attempt that decreases the objective less than the others did meanwhile. The exact method continues as long as
-its Hessian is unmodified, the decrease agrees with the quadratic model, and the squared Newton decrement g'H^-1 g falls
-faster per cost than the decrease of L-BFGS fell from group to group. An indefinite Hessian gets the smallest multiple
-of inertia that has a factor (`springbench.solvers.methods.newton.inertia_shift`), or loses negative stiffness
+last two groups of iterations (`springbench.solvers.kernels.descent_rounds`). The exact Hessian is tried first. If it
+has no Cholesky factor at the second attempt, or at the first after L-BFGS has ended, predicted tensions follow. The
+exact method is tried again after a cost that doubles with each attempt that decreases the objective less than the
+others did meanwhile. The exact method continues as long as its Hessian is unmodified, the decrease agrees with the
+quadratic model, and the squared Newton decrement g'H^-1 g falls faster per cost than the decrease of L-BFGS fell from
+group to group. An indefinite Hessian gets the smallest multiple of inertia that has a factor
+(`springbench.solvers.methods.newton.inertia_shift`), or loses negative stiffness
 (`springbench.solvers.methods.newton.hessian_regularisation`), whichever decreased the objective more per factorisation
 when last used. Costs are counted, not measured by a clock: in groups of L-BFGS iterations, from the numbers of springs,
 entries and operations of the factors and from the factorisations made. So equal solves make equal decisions and have
@@ -389,7 +390,7 @@ class LbfgsFirstState(HybridState):
 
     def _start_points(self) -> None:
         """Begin the phase of L-BFGS, whose first round starts the solve."""
-        self._is_exact = self._prepared.method.exact_lbfgs is not None
+        self._is_exact = self._prepared.method.exact_lbfgs is not None  # L-BFGS's residuals are those of the metric
         self._control.begin_phase("lbfgs")
 
     def compute_start_residual(self) -> float | None:
@@ -433,13 +434,12 @@ class LbfgsFirstState(HybridState):
 
     def residual(self) -> float:
         """Return the residual [J^(1/2)] at the current positions."""
-        if self._run is not None and self._control.residual is None:
-            self._control.residual = (
-                self._run.run_rounds(self._rounds, NO_ITERATIONS)[1]
-                if self._is_exact
-                else self._prepared.metric.residual(self._run.gradient())
-            )
+        if self._run is not None and self._is_exact and self._control.residual is None:
+            self._control.residual = self._run.run_rounds(self._rounds, NO_ITERATIONS)[1]
         return super().residual()
+
+    def _current_point(self) -> DescentPoint:
+        return super()._current_point() if self._run is None else DescentPoint(self.positions, self._run.gradient())
 
     def _end_lbfgs_alone(self, run: LbfgsSweepState, residual: float, ended: int) -> None:
         """End the phase of L-BFGS alone, and continue with the choice between the methods."""
@@ -577,13 +577,13 @@ class HybridIteration:
         self.factor = factor = objective.hessian_matrix.factor
         self._system_has_barriers = without_barriers(objective.system) is not objective.system
         self.is_very_stiff = bool((metric.free_diagonal > _MAX_EXACT_RATIO * inertia).any())
-        is_alone = not self.is_very_stiff and not objective.has_barriers
-        is_alone = is_alone and objective.system is without_vertex_contact(objective.system)
-        self.exact_lbfgs = lbfgs if is_alone and is_double else None
+        has_exact_gradients = not self.is_very_stiff and not objective.has_barriers
+        has_exact_gradients &= objective.system is without_vertex_contact(objective.system)
+        self.exact_lbfgs = lbfgs if has_exact_gradients and is_double else None
         is_projective = objective.projective_indices.issuperset(objective.element_energy_indices)
         engine = lbfgs.acceleration_engine
         self._sweep_engine = engine if isinstance(engine, LbfgsSweepEngine) else None
-        self.starts_lower = is_alone and is_projective and self._sweep_engine is not None
+        self.starts_lower = has_exact_gradients and is_projective and self._sweep_engine is not None
         springs, entries = len(objective.springs.stiffness), lbfgs.stats.get("nnz_factor", 0.0)
         constant, per_vertex, per_entry = _LBFGS_NANOSECONDS
         lbfgs_cost = constant + per_vertex * objective.system.num_vertices + per_entry * entries
