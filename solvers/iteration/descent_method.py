@@ -12,7 +12,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from math import sqrt
 from typing import ClassVar, NamedTuple, Protocol
 
 import numpy as np
@@ -20,13 +19,17 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 from springbench.solvers.iteration.iterative_solver import IterativeSolver, SolverState, compute_max_coordinate
-from springbench.solvers.jit.typed_kernel import TypedKernel
-from springbench.solvers.kernels import objective_kernels, quadratic_form_kernels
+from springbench.solvers.jit.typed_kernel import TypedKernel, as_kernel_array
+from springbench.solvers.kernels import objective_kernels
 from springbench.solvers.kernels.line_search_conditions import (
     ARMIJO_FRACTION,
+    MAX_HALVINGS,
     is_approximate_wolfe_step,
     is_armijo_step,
 )
+from springbench.solvers.kernels.residual_norm import NormMatrix, ResidualNorm, compute_correction_norm
+from springbench.solvers.linalg.cholesky.supernodal_cholesky import SupernodalCholesky, embed_factor
+from springbench.solvers.linalg.dense_inverse import DenseInverse
 from springbench.solvers.linalg.direct_solvers import DenseCholesky
 from springbench.solvers.linalg.solver_selection import build_linear_solver
 from springbench.solvers.model import system_matrix_assembly
@@ -34,9 +37,6 @@ from springbench.solvers.model.rounding_bound import EPS
 from springbench.solvers.model.step_problem import Positions, ProjectiveEnergy, StepProblem, System
 from springbench.solvers.objective.fixed_objective import FixedObjective
 from springbench.solvers.objective.step_objective import StepObjective
-
-MAX_HALVINGS = 60
-"""Maximum number of halvings; after it a step has no significant digit left."""
 
 
 class DescentPoint(NamedTuple):
@@ -205,13 +205,22 @@ class ResidualMetric:
             NotPositiveDefinite: the positions of some vertices are not determined.
             Unsupported: no linear solver fits in memory.
         """
-        self.system, self._has_penalty_pins = system, not system.pins.exact_mask.all()
+        self.system = system
         self._Q = system_matrix_assembly.assemble_system_matrix(
             system, [e for e in system.energies if isinstance(e, ProjectiveEnergy)]
         )
         self.free_block = csr_array(csr_array(self._Q[system.free_vertices])[:, system.free_vertices])
         self.free_diagonal: NDArray[np.float64] = np.asarray(self.free_block.diagonal(), np.float64)
-        self._multiply_matrix = TypedKernel(quadratic_form_kernels.multiply_matrix)
+        has_penalty_pins = not system.pins.exact_mask.all()
+        pinned = system.pins.vertices if has_penalty_pins else np.empty(0, np.int64)
+        self._norm_matrix = NormMatrix(
+            np.array(pinned, np.int64),
+            self._Q.indptr,
+            self._Q.indices,
+            self._Q.data,
+            np.empty((system.num_vertices if has_penalty_pins else 0, 3)),
+        )
+        self._compute_norm = TypedKernel(compute_correction_norm)
         self.unpinned_trace = float(self._Q.diagonal()[system.unpinned_mask].sum())
         self.stats = {"nnz_system": float(self._Q.nnz)}
         free, nothing = system.free_vertices, (DenseCholesky(np.eye(0)), "nothing to solve for")
@@ -270,12 +279,25 @@ class ResidualMetric:
             e: correction Q^-1 g (n, 3) [m], overwritten.
             gradient: gradient g (n, 3) [N].
         """
-        if not self._has_penalty_pins:  # e vanishes at exact pins, so that |e|_Q^2 = e'g
-            return max(inner_product(e, gradient), 0.0) ** 0.5  # this order of arguments returns NaN for NaN
-        e[self.system.pins.vertices] = 0.0
-        product = np.empty_like(e)
-        self._multiply_matrix.call(self._Q.indptr, self._Q.indices, self._Q.data, e, product)
-        return sqrt(max(inner_product(e, product), 0.0))  # this order of arguments returns NaN for NaN
+        return self._compute_norm.call(self._norm_matrix, e, as_kernel_array(gradient))
+
+    @cached_property
+    def supernodal_factor(self) -> SupernodalCholesky | None:
+        """The factor if kernels support it; else None.
+
+        A dense inverse is replaced by a supernodal factor, however small it is.
+        """
+        if isinstance(self.factor, DenseInverse):
+            return SupernodalCholesky(self.free_block)
+        return self.factor if isinstance(self.factor, SupernodalCholesky) else None
+
+    @cached_property
+    def kernel_norm(self) -> ResidualNorm | None:
+        """The norm for kernels, in one thread; None if they do not support the factor."""
+        if self.supernodal_factor is None:
+            return None
+        factor = embed_factor(self.supernodal_factor, self.system.free_vertices)
+        return ResidualNorm(self._norm_matrix, factor, np.zeros((self.system.num_vertices, 3)))
 
 
 @dataclass(frozen=True, eq=False)

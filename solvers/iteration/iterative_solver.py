@@ -153,6 +153,22 @@ _interpreted_loop = iteration_loop.build_loop(
 )
 
 
+class CompiledState(SolverState):
+    """The state of a solve whose iteration loop is compiled."""
+
+    @abstractmethod
+    def run_iterations(self, limits: LoopLimits) -> tuple[int, float, int]:
+        """Iterate up to the limits; return count, residual and reason."""
+
+    def step_state(self) -> bool:
+        """Do one iteration; return False if round-off prevents descent."""
+        return self.run_iterations(iteration_loop.ONE_ITERATION)[0] == 1
+
+    def residual(self) -> float:
+        """Return the residual [J^(1/2)] at the iterate."""
+        return self.run_iterations(iteration_loop.NO_ITERATIONS)[1]
+
+
 class IterativeSolver(ABC):
     """A method after the setup for a system.
 

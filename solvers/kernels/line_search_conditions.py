@@ -15,6 +15,9 @@ from springbench.solvers.jit.kernel_compilation import jit_inner_options
 ARMIJO_FRACTION = 1e-4
 """Smallest decrease of a step, as a fraction of the linear prediction."""
 
+MAX_HALVINGS = 60
+"""Maximum number of halvings; after it a step has no significant digit left."""
+
 
 @register_jitable(**jit_inner_options)
 def is_armijo_step(objective_change: float, step_size: float, slope: float, curvature: float) -> bool:

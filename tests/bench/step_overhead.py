@@ -37,7 +37,7 @@ METHODS = (
     *("numba", "anderson", "chebyshev", "lbfgs", "admm", "a-jacobi", "pncg", "hybrid", "vbd", "avbd"),
     *("xpbd", "xpbd-small-steps", "symplectic-euler", "velocity-verlet", "newton", "newton-cg"),
 )
-"""The methods with compiled iterations, and Newton's methods, whose iterations are compiled one by one."""
+"""The methods with compiled iterations."""
 MIN_SAMPLE_SECONDS = 30e-6
 MORE_ITERATIONS = 10
 BATCH_SOLVES = 50

@@ -8,6 +8,7 @@ from itertools import islice, pairwise
 import numpy as np
 import pytest
 from springbench.harness.reference.hessian_curvature import build_free_hessian
+from springbench.harness.scenes.effects.bending_effect import BendingEffect
 from springbench.harness.scenes.effects.gravity_effect import GravityEffect
 from springbench.harness.scenes.effects.pins_effect import PinsEffect as PinsEffect
 from springbench.harness.scenes.effects.springs_effect import SpringsEffect as SpringsEffect
@@ -18,7 +19,7 @@ from springbench.solvers.iteration.descent_method import PreparedDescent
 from springbench.solvers.methods.newton.hybrid_newton import HybridNewton
 from springbench.solvers.methods.newton.negative_curvature import is_positive_definite
 from springbench.solvers.methods.newton.newton_cg import NewtonCG
-from springbench.solvers.methods.newton.newton_direct import NewtonSolver
+from springbench.solvers.methods.newton.newton_direct import NewtonSolver, PreparedExactNewton
 from springbench.solvers.model.step_problem import Positions, StepProblem, StopRule
 from springbench.solvers.objective.fixed_objective import FixedObjective
 from springbench.solvers.objective.step_objective import StepObjective
@@ -90,6 +91,40 @@ def test_any_ratio_of_stiffness_to_inertia_ends_at_a_certified_minimum(ratio, so
     solution = solver.prepare(system).solve(given, StopRule(4000))
     assert solution.termination_reason == "stalled"
     assert is_certified(given, solution.positions)
+
+
+def build_bending_cloth() -> StepProblem:
+    pins = PinsEffect.model_validate({"parts": ["top_corners"], "weight": "exact"})
+    effects = SpringsEffect(stretch=300.0, shear=60.0), GravityEffect(), BendingEffect(stiffness=1e-3), pins
+    return build_first_problem(build_test_scene(GridMesh(), *effects, size=8))
+
+
+@pytest.mark.parametrize(
+    "build",
+    [
+        build_bending_cloth,
+        lambda: build_random_problem(5, n=30, m=80),
+        *(lambda case=case: build_case_step(case) for case in CASES.values()),
+    ],
+    ids=["bending", "random springs", *CASES],
+)
+def test_compiled_iterations_are_those_of_the_interpreted_loop(build):
+    given = build()
+    compiled, interpreted = (NewtonSolver().prepare(given.system) for _ in range(2))
+    assert isinstance(compiled, PreparedExactNewton)
+    assert isinstance(interpreted, PreparedExactNewton)
+    assert compiled.compiled_arrays is not None
+    vars(interpreted)["compiled_arrays"] = None
+    for p, q in islice(zip(compiled.iterates(given), interpreted.iterates(given), strict=False), 40):
+        np.testing.assert_array_equal(p, q)
+    for stop in (StopRule(7), StopRule(60, 1e-6), StopRule(300)):
+        found, expected = compiled.solve(given, stop), interpreted.solve(given, stop)
+        np.testing.assert_array_equal(found.positions, expected.positions)
+        assert found.num_iterations == expected.num_iterations
+        assert found.termination_reason == expected.termination_reason
+        assert found.residual == pytest.approx(expected.residual, rel=1e-12, abs=1e-300)
+    factors = [one.fixed_objective.hessian_matrix.factor for one in (compiled, interpreted)]
+    assert factors[0].num_factorisations == pytest.approx(factors[1].num_factorisations)
 
 
 def test_newton_converges_quadratically():

@@ -37,6 +37,16 @@ _MIN_FACTORISATION = 0.2
 """Cost of assembling a matrix whose factorisation fails at once, as a fraction of a factorisation."""
 
 
+class KernelFactor(NamedTuple):
+    """Arguments of `run_stages` for factorisations in one thread, without the matrix and the right-hand side."""
+
+    fronts: FrontalStructure
+    schedule: FactorisationSchedule
+    panels: NDArray[np.float64]
+    scratch: FactorisationScratch
+    thread_team: ThreadTeam
+
+
 class _Workspace(NamedTuple):
     """Schedules, scratch memory, shared state and kernel for a number of threads, None for one."""
 
@@ -142,9 +152,32 @@ class BlockCholesky:
         kernel = TypedKernel(run_stages)
         return _Workspace(schedule, select_solve(schedule), scratch, team, threads if threads > 1 else None, kernel)
 
+    @property
+    def num_threads(self) -> int:
+        """Number of threads of a factorisation: Numba's, or one if that is faster."""
+        return numba.get_num_threads() if self.flops >= _MIN_THREADED_FLOPS else 1
+
+    @property
+    def kernel_factor(self) -> KernelFactor:
+        """The factor for kernels, which call `run_stages` in one thread."""
+        schedule, _, scratch, team, *_ = self._workspaces[1]
+        return KernelFactor(self.fronts, schedule, self.panels, scratch, team)
+
+    def count_factorisations(self, num_complete: int, failed_supernode: int) -> None:
+        """Add factorisations to the count.
+
+        Args:
+            num_complete: number of those that succeeded.
+            failed_supernode: supernode at which one more failed, -1 for none.
+        """
+        self._count.total += num_complete
+        if failed_supernode >= 0:
+            done = float(self._flops[:failed_supernode].sum()) / self.flops
+            self._count.total += max(_MIN_FACTORISATION, done)
+
     def _current_workspace(self) -> _Workspace:
-        """Return the workspace for Numba's number of threads, or for one if that is faster."""
-        threads = numba.get_num_threads() if self.flops >= _MIN_THREADED_FLOPS else 1
+        """Return the workspace for the current number of threads."""
+        threads = self.num_threads
         if threads not in self._workspaces:
             self._workspaces[threads] = self._allocate(*self._plan(threads), threads)
         return self._workspaces[threads]
@@ -164,8 +197,7 @@ class BlockCholesky:
         self.failed_vertex = -1
         if failed >= 0:
             self.failed_vertex = int(scratch.failed_vertices[np.argmin(scratch.failures)])
-        done = 1.0 if failed < 0 else float(self._flops[:failed].sum()) / self.flops
-        self._count.total += max(_MIN_FACTORISATION, done)
+        self.count_factorisations(int(failed < 0), failed)
         return failed < 0
 
     def solve(self, b: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -218,3 +218,28 @@ class SupernodalCholesky:
         """Return the number of threads of a solve, None for one."""
         threads = min(numba.get_num_threads(), len(self.work_shares) - 1)
         return threads if threads > 1 and self.factor_bytes >= _MIN_THREADED_BYTES else None
+
+
+def embed_factor(factor: SupernodalCholesky, free: NDArray[np.int64]) -> SupernodalFactor:
+    """Embed a factor over the free vertices into vectors of all vertices.
+
+    Args:
+        factor: float64 factor of Q's free rows and columns (f, f).
+        free: the free vertices (f,).
+
+    Returns:
+        Factor with a work vector and thread team of its own; a solve neither reads nor writes the other vertices.
+    """
+    at = factor.layout
+    by_slot, by_vertex = (
+        np.stack([free[order[:, 0]], order[:, 1]], axis=1).astype(np.uint32)
+        for order in (at.order_by_slot, at.order_by_vertex)
+    )
+    lists = at.row_slots, at.chunks, at.group_spans, by_slot, by_vertex
+    return SupernodalFactor(
+        factor.inverse_blocks,
+        factor.panels,
+        *lists,
+        np.zeros(4 * at.num_work_rows),
+        ThreadTeam.from_task_count(len(at.group_spans) - 1),
+    )

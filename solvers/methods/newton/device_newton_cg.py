@@ -35,10 +35,10 @@ from springbench.solvers.cuda.device_schwarz import (
 )
 from springbench.solvers.cuda.device_solver import DeviceSolverState, MinimisingSolver
 from springbench.solvers.cuda.device_step import DeviceStep, LoadedStep, UploadedNetwork
-from springbench.solvers.iteration.descent_method import MAX_HALVINGS, ResidualMetric
+from springbench.solvers.iteration.descent_method import ResidualMetric
 from springbench.solvers.iteration.iterative_solver import compute_max_coordinate
 from springbench.solvers.iteration.preconditioners import MIN_DIAGONAL_FRACTION, PreconditionerName
-from springbench.solvers.kernels.line_search_conditions import is_armijo_step
+from springbench.solvers.kernels.line_search_conditions import MAX_HALVINGS, is_armijo_step
 from springbench.solvers.linalg.additive_schwarz import order_into_subdomains
 from springbench.solvers.model.step_problem import StepProblem, System, Unsupported
 from springbench.solvers.objective.fixed_objective import FixedObjective

@@ -105,6 +105,14 @@ class ShiftScheduleRule:
     It is the only rule that supports energies without an element-wise form.
     """
 
+    def __init__(self, first_level: int = 0) -> None:
+        """Create the rule.
+
+        Args:
+            first_level: first level of the schedule to try; 1 if the exact Hessian is known to have no factor.
+        """
+        self._first_level = first_level
+
     def factorise_hessian(self, hessian: Hessian, at: DescentPoint, diagonal: NDArray[np.float64]) -> int | None:
         """Factorise at the first level of the schedule that has a factor.
 
@@ -116,7 +124,7 @@ class ShiftScheduleRule:
         Returns:
             The level in SHIFT_SCHEDULE; None if no level has a factor.
         """
-        return factorise_shifted(hessian, diagonal)
+        return factorise_shifted(hessian, diagonal, first_level=self._first_level)
 
     def record_step(self, step: StepObjective, hessian: Hessian, at: DescentPoint, to: DescentPoint) -> None:
         """Record nothing.

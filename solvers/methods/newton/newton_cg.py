@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
@@ -25,6 +26,7 @@ from springbench.solvers.iteration.descent_method import (
 )
 from springbench.solvers.iteration.device_interface import PrecisionOptions
 from springbench.solvers.iteration.idle_contact import skip_idle_contact
+from springbench.solvers.iteration.iterative_solver import CompiledState, SolverState
 from springbench.solvers.iteration.preconditioners import (
     Preconditioner,
     PreconditionerName,
@@ -33,24 +35,27 @@ from springbench.solvers.iteration.preconditioners import (
 )
 from springbench.solvers.iteration.solver_info import Citation, SolverInfo
 from springbench.solvers.jit.typed_kernel import TypedKernel
-from springbench.solvers.linalg.cholesky.supernodal_cholesky import SupernodalCholesky
-from springbench.solvers.linalg.dense_inverse import DenseInverse
+from springbench.solvers.kernels.iteration_loop import LoopLimits
+from springbench.solvers.kernels.quadratic_form_kernels import QuadraticForm
 from springbench.solvers.linalg.krylov import NEGATIVE_CURVATURE, ConjugateGradientIteration
 from springbench.solvers.methods.newton import newton_cg_kernel
+from springbench.solvers.methods.newton.newton_cg_kernel import (
+    MAX_CG_ITERATIONS,
+    MAX_ETA,
+    MIN_ETA,
+    NEWTON_CG_PROGRESS_DTYPE,
+    NewtonCGArrays,
+    NewtonEquation,
+    update_eta,
+)
 from springbench.solvers.methods.newton.newton_direct import make_friction_search
-from springbench.solvers.model.step_problem import Positions, PreparedSolver, System
+from springbench.solvers.model.step_problem import Positions, PreparedSolver, StepProblem, System
 from springbench.solvers.objective.fixed_objective import FixedObjective
 from springbench.solvers.objective.step_objective import Hessian, StepObjective
-
-_MAX_ETA, _MIN_ETA = 0.5, 1e-10
-"""Upper and lower bound of eta."""
 
 _MAX_ETA_IN_CONTACT = 1e-4
 """Upper bound of eta with active contacts: sticking friction acts within 1e-8 m, and a direction with a small error on
 that scale leads to where another quadratic model is valid."""
-
-_MAX_CG_ITERATIONS = 1000
-"""Maximum number of conjugate gradient iterations: the stiffest springs need it for a few digits."""
 
 
 @dataclass(frozen=True)
@@ -94,12 +99,12 @@ class NewtonCG(PrecisionOptions):
             from springbench.solvers.methods.newton.device_newton_cg import prepare_newton_cg
 
             return prepare_newton_cg(
-                system, self.preconditioner, self.real_dtype, (_MAX_ETA, _MIN_ETA), _MAX_CG_ITERATIONS
+                system, self.preconditioner, self.real_dtype, (MAX_ETA, MIN_ETA), MAX_CG_ITERATIONS
             )
         metric = ResidualMetric(system)
         objective = FixedObjective(system)
         method = TruncatedNewtonIteration(metric, objective, self.preconditioner)
-        found = PreparedDescent(
+        found = PreparedTruncatedNewton(
             objective, metric, method, metric.description + objective.interpreted_energies, metric.stats
         )
         return skip_idle_contact(found, system, lambda: replace(found, fixed_objective=objective.ignore_barriers()))
@@ -114,8 +119,8 @@ class TruncatedNewtonIteration:
         self, metric: ResidualMetric, objective: FixedObjective, preconditioner: PreconditionerName = "cholesky"
     ) -> None:
         self._metric, self._linearise_at = metric, build_preconditioner(preconditioner, metric, objective, "newton-cg")
-        factor = _compiled_factor(metric) if preconditioner == "cholesky" else None
-        self.compiled_cg = _CompiledCG(objective, factor) if factor else None
+        is_compiled = preconditioner == "cholesky" and metric.kernel_norm is not None
+        self.compiled_cg = CompiledCG(metric) if is_compiled else None
         self._friction_search = make_friction_search(metric)
 
     def iterate_points(self, step: StepObjective, start: DescentPoint) -> Iterator[DescentPoint]:
@@ -125,7 +130,7 @@ class TruncatedNewtonIteration:
             step: objective of the step.
             start: first point, which is not yielded; friction is relaxed there.
         """
-        loose = _MAX_ETA_IN_CONTACT if step.has_contact_elements else _MAX_ETA
+        loose = _MAX_ETA_IN_CONTACT if step.has_contact_elements else MAX_ETA
         point, eta = (
             self._friction_search.relax_initial_point(step, start)
             if self._friction_search and step.has_contact_elements
@@ -146,9 +151,7 @@ class TruncatedNewtonIteration:
                 return
             hessian, solve = self._linearise_at(step, found.positions)
             before, descent = inner_product(point.gradient, descent), solve(found.gradient)
-            # Safeguard of Eisenstat and Walker: eta is at least 0.9 times its previous square, while that exceeds 0.1.
-            following = 0.9 * inner_product(found.gradient, descent) / before
-            eta = min(loose, max(_MIN_ETA, following, 0.9 * eta**2 if 0.9 * eta**2 > 0.1 else 0.0))
+            eta = update_eta(eta, inner_product(found.gradient, descent), before, loose)
             point = found
             yield point
 
@@ -201,7 +204,7 @@ class TruncatedNewtonIteration:
             return self.compiled_cg.compute_direction(hessian, solve, at, descent, eta)
         product = inner_product(at.gradient, descent)
         newton = _NewtonSystemCG(hessian, solve, at.gradient, descent, eta**2 * product)
-        count, ended = newton.run_iterations(product, _MAX_CG_ITERATIONS)
+        count, ended = newton.run_iterations(product, MAX_CG_ITERATIONS)
         return newton.search_direction if ended == NEGATIVE_CURVATURE and count == 0 else newton.solution
 
 
@@ -251,36 +254,117 @@ class _NewtonSystemCG(ConjugateGradientIteration):
         return product <= self._limit
 
 
-def _compiled_factor(metric: ResidualMetric) -> SupernodalCholesky | None:
-    """Return a factor of Q that the kernels support, or None.
+class CompiledCG:
+    """Conjugate gradients in one kernel, for springs, quadratic forms and elements.
 
-    A dense inverse is replaced by a supernodal factor, however small it is.
+    Without elements and in one thread, whole iterations of Newton-CG are compiled.
+
+    Attributes:
+        run_newton_cg: the compiled iterations.
     """
-    if isinstance(metric.factor, DenseInverse):
-        return SupernodalCholesky(metric.free_block)
-    return metric.factor if isinstance(metric.factor, SupernodalCholesky) else None
 
+    def __init__(self, metric: ResidualMetric) -> None:
+        """Prepare the kernels.
 
-class _CompiledCG:
-    """Conjugate gradients in one kernel, for springs, quadratic forms and elements."""
-
-    def __init__(self, objective: FixedObjective, factor: SupernodalCholesky) -> None:
-        system = objective.system
-        self._thread_count, self._exact_pins = factor.choose_num_threads, system.pins.vertices[system.pins.exact_mask]
-        self._factor = newton_cg_kernel.embed_factor(factor, system.free_vertices)
+        Args:
+            metric: norm of residuals, whose factor kernels support.
+        """
+        factor, norm, system = metric.supernodal_factor, metric.kernel_norm, metric.system
+        assert factor is not None
+        assert norm is not None
+        self._thread_count, self._factor = factor.choose_num_threads, norm.factor
+        self._exact_pins = system.pins.vertices[system.pins.exact_mask]
         self._scratch = np.zeros((4, system.num_vertices, 3))
         self._solve_usual = TypedKernel(newton_cg_kernel.solve_direction)
+        self.run_newton_cg = TypedKernel(newton_cg_kernel.run_newton_cg)
+        self._metric, self._norm = metric, norm
+
+    def build_arrays(self, objective: FixedObjective) -> NewtonCGArrays | None:
+        """Build the arrays of compiled iterations; return None if they are not supported.
+
+        Args:
+            objective: objective of the system, perhaps without barriers.
+        """
+        if objective.element_energy_indices or objective.other_energy_indices:
+            return None
+        size = objective.system.num_vertices, 3
+        terms, form = objective.objective_terms, objective.quadratic_form or QuadraticForm.empty_form()
+        linear = np.empty((len(terms.stiffness), 4))
+        solving = self._factor, None, self._exact_pins, None
+        equation = NewtonEquation((terms, linear, form, None, None), *solving, np.zeros(size), *self._scratch)
+        trial = np.empty((2, *size))
+        return NewtonCGArrays(terms, form, linear, equation, self._metric.unpinned_trace, self._norm, *trial)
+
+    @property
+    def is_threaded(self) -> bool:
+        """Whether solves with Q use several threads."""
+        return self._thread_count() is not None
 
     def compute_direction(
         self, hessian: Hessian, solve: Preconditioner, at: DescentPoint, descent: Positions, eta: float
     ) -> Positions:
-        """Solve H d = -g approximately; `descent` is the preconditioned gradient."""
+        """Solve H d = -g approximately.
+
+        Args:
+            hessian: H.
+            solve: preconditioner.
+            at: current point, with g.
+            descent: preconditioned gradient (n, 3) [m].
+            eta: tolerance relative to |g|.
+
+        Returns:
+            Direction d (n, 3) [m].
+        """
         d = np.empty_like(descent)
         shrunk = solve.inverse_scaling if isinstance(solve, ScaledPreconditioner) else None
         solving = self._factor, self._thread_count(), self._exact_pins, shrunk
-        newton = newton_cg_kernel.NewtonEquation(hessian.kernel_arguments, *solving, d, *self._scratch)
+        newton = NewtonEquation(hessian.kernel_arguments, *solving, d, *self._scratch)
         is_usual = shrunk is None and newton.num_threads is None and not hessian.element_hessians
         solve_direction = self._solve_usual.call if is_usual else newton_cg_kernel.solve_direction
         gradient = np.ascontiguousarray(at.gradient)
-        solve_direction(newton, gradient, np.ascontiguousarray(descent), eta, _MAX_CG_ITERATIONS)
+        solve_direction(newton, gradient, np.ascontiguousarray(descent), eta, MAX_CG_ITERATIONS)
         return d
+
+
+class PreparedTruncatedNewton(PreparedDescent):
+    """Newton-CG after the setup for a system.
+
+    Iterations are compiled for springs and quadratic forms, with the factor of Q as preconditioner.
+    """
+
+    method: TruncatedNewtonIteration
+
+    @cached_property
+    def compiled_arrays(self) -> NewtonCGArrays | None:
+        """Arrays of compiled iterations in one thread, or None if they are not supported."""
+        return self.method.compiled_cg and self.method.compiled_cg.build_arrays(self.fixed_objective)
+
+    def init_state(self, problem: StepProblem, initial_guess: Positions) -> SolverState:
+        """Start a solve.
+
+        Args:
+            problem: the step.
+            initial_guess: positions (n, 3) [m], which are not modified.
+        """
+        compiled, arrays = self.method.compiled_cg, self.compiled_arrays
+        if compiled is None or arrays is None or compiled.is_threaded:
+            return super().init_state(problem, initial_guess)
+        return _CompiledNewtonCGState(compiled.run_newton_cg, arrays, *self._build_step(problem, initial_guess))
+
+
+class _CompiledNewtonCGState(CompiledState):
+    """The state of a solve with compiled iterations."""
+
+    def __init__(self, run: TypedKernel, arrays: NewtonCGArrays, step: StepObjective, start: DescentPoint) -> None:
+        self._run, self._arrays, self._step_arrays = run, arrays, (step.step_data, step.exact_pins)
+        self.positions, self._gradient, self._descent = *start[:2], np.zeros_like(start.gradient)
+        self._progress = np.zeros(1, NEWTON_CG_PROGRESS_DTYPE)
+
+    def compute_start_residual(self) -> float:
+        """Return the residual at the initial guess [J^(1/2)]."""
+        return self.residual()
+
+    def run_iterations(self, limits: LoopLimits) -> tuple[int, float, int]:
+        """Iterate up to the limits; return count, residual and reason."""
+        point = self.positions, self._gradient, self._descent
+        return self._run.call(self._arrays, *self._step_arrays, limits, *point, self._progress)

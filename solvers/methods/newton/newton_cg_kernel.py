@@ -1,6 +1,8 @@
-"""Compiled conjugate gradients on the exact Hessian, preconditioned by a factor of Q.
+"""Compiled iterations of Newton-CG.
 
-    H d = -g to |H d + g| <= limit,   |r|^2 = r' Q^-1 r
+    H d = -g to |H d + g| <= limit,   |r|^2 = r' Q^-1 r,   p <- p + t d
+
+Conjugate gradients on the exact Hessian are preconditioned by a factor of Q.
 
 `springbench.solvers.methods.newton.newton_cg` describes the method.
 """
@@ -10,38 +12,28 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
+from numba.extending import register_jitable
 from numpy.typing import NDArray
-from springbench.solvers.jit.kernel_compilation import jit_inner, jit_kernel
-from springbench.solvers.kernels.spring_hessian import multiply_hessian
-from springbench.solvers.linalg.cholesky.supernodal_cholesky import SupernodalCholesky
-from springbench.solvers.linalg.cholesky.thread_team import ThreadTeam
+from springbench.solvers.jit.kernel_compilation import jit_inner, jit_inner_options, jit_kernel
+from springbench.solvers.kernels.iteration_loop import build_compiled_loop
+from springbench.solvers.kernels.objective_kernels import (
+    ObjectiveTerms,
+    compute_inner_product,
+    compute_max_magnitude,
+    search_backtracking,
+)
+from springbench.solvers.kernels.quadratic_form_kernels import QuadraticForm
+from springbench.solvers.kernels.residual_norm import ResidualNorm, compute_correction_norm
+from springbench.solvers.kernels.spring_hessian import linearise_springs, multiply_hessian
 from springbench.solvers.linalg.cholesky.triangular_solve import SupernodalFactor, solve_supernodal
 from springbench.solvers.linalg.krylov import NEGATIVE_CURVATURE, compile_cg_loop
+from springbench.solvers.model.rounding_bound import EPS
 
+MAX_ETA, MIN_ETA = 0.5, 1e-10
+"""Upper and lower bound of eta."""
 
-def embed_factor(factor: SupernodalCholesky, free: NDArray[np.int64]) -> SupernodalFactor:
-    """Embed a factor over the free vertices into vectors of all vertices.
-
-    Args:
-        factor: float64 factor of Q's free rows and columns (f, f).
-        free: the free vertices (f,).
-
-    Returns:
-        Factor with a work vector and thread team of its own; a solve neither reads nor writes the other vertices.
-    """
-    at = factor.layout
-    by_slot, by_vertex = (
-        np.stack([free[order[:, 0]], order[:, 1]], axis=1).astype(np.uint32)
-        for order in (at.order_by_slot, at.order_by_vertex)
-    )
-    lists = at.row_slots, at.chunks, at.group_spans, by_slot, by_vertex
-    return SupernodalFactor(
-        factor.inverse_blocks,
-        factor.panels,
-        *lists,
-        np.zeros(4 * at.num_work_rows),
-        ThreadTeam.from_task_count(len(at.group_spans) - 1),
-    )
+MAX_CG_ITERATIONS = 1000
+"""Maximum number of conjugate gradient iterations: the stiffest springs need it for a few digits."""
 
 
 class NewtonEquation(NamedTuple):
@@ -80,7 +72,7 @@ def _update_direction(state, product, before):
     for v in newton.fixed_vertices:
         for c in range(3):
             newton.hessian_product[v, c] = 0.0
-    return _inner_product(newton.p, newton.hessian_product)
+    return compute_inner_product(newton.p, newton.hessian_product)
 
 
 @jit_inner
@@ -94,7 +86,7 @@ def _update_iterate(state, product, curvature):
     b = _scaled_copy(newton.inverse_scaling, newton.r, newton.hessian_product)
     solve_supernodal(newton.factor, b, newton.z, newton.num_threads)
     _apply_scaling(newton.inverse_scaling, newton.z)
-    return _inner_product(newton.r, newton.z)
+    return compute_inner_product(newton.r, newton.z)
 
 
 @jit_inner
@@ -153,7 +145,7 @@ def solve_direction(newton, gradient, descent, eta, most):
         for c in range(3):
             newton.d[i, c] = newton.p[i, c] = 0.0
             newton.r[i, c], newton.z[i, c] = -gradient[i, c], -descent[i, c]
-    product = _inner_product(gradient, descent)
+    product = compute_inner_product(gradient, descent)
     count, ended = _iterate_loop((newton, eta * eta * product), product, most)
     if ended == NEGATIVE_CURVATURE and count == 0:
         for i in range(len(newton.d)):
@@ -161,9 +153,113 @@ def solve_direction(newton, gradient, descent, eta, most):
                 newton.d[i, c] = newton.p[i, c]
 
 
+NEWTON_CG_PROGRESS_DTYPE = np.dtype(
+    [
+        ("is_started", np.int64),  # whether the preconditioned gradient is that of the current point
+        ("eta", np.float64),  # tolerance of the next direction, relative to |g|
+        ("residual", np.float64),  # at the current point [J^(1/2)]; negative: not yet known
+    ]
+)
+"""The progress of a solve."""
+
+
+class NewtonCGArrays(NamedTuple):
+    """Arrays of the iteration for one system, without elements.
+
+    Attributes:
+        terms: springs, inertia and penalty pins.
+        form: sum of the quadratic forms.
+        linear_terms: scratch, the linearised springs (m, 4).
+        equation: Newton equation with that linearisation and no scaling, in one thread.
+        unpinned_trace: trace of the unpinned part of Q [N/m].
+        norm: norm of residuals.
+        trial_positions, trial_gradient: scratch, (n, 3) [m] and [N].
+    """
+
+    terms: ObjectiveTerms
+    form: QuadraticForm
+    linear_terms: NDArray[np.float64]
+    equation: NewtonEquation
+    unpinned_trace: float
+    norm: ResidualNorm
+    trial_positions: NDArray[np.float64]
+    trial_gradient: NDArray[np.float64]
+
+
+@register_jitable(**jit_inner_options)
+def update_eta(eta, square, square_before, max_eta):
+    """Return the tolerance of the next direction, by the second choice of Eisenstat and Walker (1996).
+
+    Their safeguard limits it to at least 0.9 times the square of the last tolerance, while that exceeds 0.1.
+
+    Args:
+        eta: last tolerance, relative to |g|.
+        square, square_before: square of |g| after and before the step [J].
+        max_eta: upper bound.
+    """
+    guarded = 0.9 * eta**2
+    return min(max_eta, max(MIN_ETA, 0.9 * square / square_before, guarded if guarded > 0.1 else 0.0))
+
+
 @jit_inner
-def _inner_product(a, b):
-    total = 0.0
-    for i in range(len(a)):
-        total += a[i, 0] * b[i, 0] + a[i, 1] * b[i, 1] + a[i, 2] * b[i, 2]
-    return total
+def _take_step(state):
+    """Do a step; return whether the positions changed."""
+    arrays, step_data, exact_pins, p, gradient, descent, progress = state
+    now, newton, product = progress[0], arrays.equation, compute_inner_product(gradient, descent)
+    if not product > (EPS * compute_max_magnitude(p)) ** 2 * arrays.unpinned_trace:
+        return False
+    linearise_springs(arrays.terms, p, arrays.linear_terms)
+    solve_direction(newton, gradient, descent, now.eta, MAX_CG_ITERATIONS)
+    search = arrays.terms, arrays.form, step_data, exact_pins, p
+    q, following, slope = arrays.trial_positions, arrays.trial_gradient, compute_inner_product(gradient, newton.d)
+    if not search_backtracking(*search, newton.d, slope, q, following):
+        for v in range(len(p)):
+            for c in range(3):
+                newton.d[v, c] = -descent[v, c]
+        if not search_backtracking(*search, newton.d, -product, q, following):
+            return False
+    for v in range(len(p)):
+        for c in range(3):
+            p[v, c], gradient[v, c] = q[v, c], following[v, c]
+    solve_supernodal(newton.factor, gradient, descent, None)
+    now.eta = update_eta(now.eta, compute_inner_product(gradient, descent), product, MAX_ETA)
+    now.residual = -1.0
+    return True
+
+
+@jit_inner
+def _compute_residual(state):
+    arrays, _, _, _, gradient, descent, progress = state
+    now, correction = progress[0], arrays.norm.correction
+    if now.residual < 0.0:
+        for v in range(len(descent)):
+            for c in range(3):
+                correction[v, c] = descent[v, c]
+        now.residual = compute_correction_norm(arrays.norm.matrix, correction, gradient)
+    return now.residual
+
+
+_newton_loop = build_compiled_loop(_take_step, _compute_residual)
+
+
+@jit_kernel
+def run_newton_cg(arrays, step_data, exact_pins, limits, p, gradient, descent, progress):
+    """Run the iteration loop (`springbench.solvers.kernels.iteration_loop`).
+
+    Args:
+        arrays: arrays of the system.
+        step_data: data of the step.
+        exact_pins: exactly pinned vertices and their targets.
+        limits: limits of the loop, in iterations.
+        p: positions (n, 3) [m], updated.
+        gradient: gradient there (n, 3) [N], updated.
+        descent: preconditioned gradient Q^-1 g (n, 3) [m], updated; zero at exactly pinned vertices.
+        progress: progress of the solve (1,), updated.
+
+    Returns:
+        Number of iterations, last residual [J^(1/2)] and termination reason.
+    """
+    if progress[0].is_started == 0:
+        solve_supernodal(arrays.equation.factor, gradient, descent, None)
+        progress[0].is_started, progress[0].eta, progress[0].residual = 1, MAX_ETA, -1.0
+    return _newton_loop((arrays, step_data, exact_pins, p, gradient, descent, progress), limits)

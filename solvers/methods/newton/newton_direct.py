@@ -20,6 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
@@ -33,7 +34,18 @@ from springbench.solvers.iteration.descent_method import (
     inner_product,
 )
 from springbench.solvers.iteration.idle_contact import skip_idle_contact
+from springbench.solvers.iteration.iterative_solver import CompiledState, SolverState
 from springbench.solvers.iteration.solver_info import Citation, SolverInfo
+from springbench.solvers.jit.typed_kernel import TypedKernel
+from springbench.solvers.kernels.iteration_loop import (
+    REASON_ITERATIONS,
+    RESIDUAL_EACH,
+    LoopLimits,
+    check_residual,
+)
+from springbench.solvers.kernels.quadratic_form_kernels import QuadraticForm
+from springbench.solvers.kernels.residual_norm import ResidualNorm
+from springbench.solvers.methods.newton import newton_kernel
 from springbench.solvers.methods.newton.hessian_regularisation import (
     REGULARISATION_RULES,
     SHIFT_SCHEDULE,
@@ -43,8 +55,9 @@ from springbench.solvers.methods.newton.hessian_regularisation import (
     ShiftScheduleRule,
 )
 from springbench.solvers.methods.newton.negative_curvature import escape_saddle, is_positive_definite
+from springbench.solvers.methods.newton.newton_kernel import NEWTON_PROGRESS_DTYPE, NewtonArrays
 from springbench.solvers.model.barrier_energy import is_barrier_energy
-from springbench.solvers.model.step_problem import Positions, PreparedSolver, System, Unsupported
+from springbench.solvers.model.step_problem import Positions, PreparedSolver, StepProblem, System, Unsupported
 from springbench.solvers.objective.fixed_objective import FixedObjective
 from springbench.solvers.objective.step_objective import StepObjective
 
@@ -100,12 +113,136 @@ class NewtonSolver:
         choice = f"a factor of the Hessian with {factor.nonzeros:,} entries; residuals by {metric.description}"
         choice += objective.interpreted_energies
         method = NewtonIteration(metric, self.indefinite_strategy)
-        found = PreparedDescent(objective, metric, method, choice, facts)
+        found = PreparedExactNewton(objective, metric, method, choice, facts)
         return skip_idle_contact(found, system, lambda: replace(found, fixed_objective=objective.ignore_barriers()))
 
 
+class PreparedExactNewton(PreparedDescent):
+    """Newton's method after the setup for a system.
+
+    Iterations are compiled where all energies are springs and quadratic forms, and their elements are not projected.
+    """
+
+    method: NewtonIteration
+
+    @cached_property
+    def compiled_arrays(self) -> NewtonArrays | None:
+        """Arrays of compiled iterations in one thread, or None if they are not supported."""
+        if not self.method.regularises_by_schedule or self.metric.kernel_norm is None:
+            return None
+        return build_newton_arrays(self.fixed_objective, self.metric.unpinned_trace, self.metric.kernel_norm)
+
+    @cached_property
+    def run_exact_steps(self) -> TypedKernel:
+        """The compiled iterations."""
+        return TypedKernel(newton_kernel.run_exact_steps)
+
+    def init_state(self, problem: StepProblem, initial_guess: Positions) -> SolverState:
+        """Start a solve.
+
+        Args:
+            problem: the step.
+            initial_guess: positions (n, 3) [m], which are not modified.
+        """
+        if self.compiled_arrays is None or self.fixed_objective.hessian_matrix.factor.num_threads > 1:
+            return super().init_state(problem, initial_guess)
+        return _CompiledNewtonState(self, self.compiled_arrays, *self._build_step(problem, initial_guess))
+
+
+class _CompiledNewtonState(CompiledState):
+    """The state of a solve with compiled iterations where the exact Hessian has a factor."""
+
+    def __init__(
+        self, prepared: PreparedExactNewton, arrays: NewtonArrays, step: StepObjective, start: DescentPoint
+    ) -> None:
+        self._prepared, self._arrays, self._step = prepared, arrays, step
+        self.positions, self._gradient = start.positions, start.gradient
+        self._progress = np.zeros(1, NEWTON_PROGRESS_DTYPE)
+        self._progress["residual"] = -1.0
+
+    def run_iterations(self, limits: LoopLimits) -> tuple[int, float, int]:
+        """Iterate up to the limits; return count, residual and reason."""
+        count, residual, ended = self._run_exact_steps(limits)
+        while self._progress["failed_supernode"][0] >= 0 and self._take_regularised_step():
+            count += 1
+            left = limits._replace(max_iterations=limits.max_iterations - count)
+            if limits.residual_mode == RESIDUAL_EACH:
+                residual = self.residual()
+                ended = check_residual(residual, limits)
+                if ended != REASON_ITERATIONS:
+                    break
+            more, residual, ended = self._run_exact_steps(left)
+            count += more
+        return count, residual, ended
+
+    def _run_exact_steps(self, limits: LoopLimits) -> tuple[int, float, int]:
+        """Iterate as long as the exact Hessian has a factor; return count, residual and reason."""
+        progress, data = self._progress, (self._step.step_data, self._step.exact_pins)
+        found = self._prepared.run_exact_steps.call(
+            self._arrays, *data, limits, self.positions, self._gradient, progress
+        )
+        self._prepared.fixed_objective.hessian_matrix.factor.count_factorisations(
+            int(progress["num_factorisations"][0]), int(progress["failed_supernode"][0])
+        )
+        return found
+
+    def _take_regularised_step(self) -> bool:
+        """Do a step where the exact Hessian has no factor; return whether the positions changed."""
+        at = DescentPoint(self.positions.copy(), self._gradient.copy())
+        steepest = float(self._progress["steepest_slope"][0])
+        found, steepest = self._prepared.method.next_point(self._step, at, steepest, ShiftScheduleRule(1))
+        self._progress["steepest_slope"] = steepest
+        if found.is_stalled:
+            self._progress["is_stalled"] = 1
+            return False
+        self.positions[:], self._gradient[:] = found.positions, found.gradient
+        self._progress["residual"] = -1.0
+        return True
+
+    def compute_start_residual(self) -> float:
+        """Return the residual at the initial guess [J^(1/2)]."""
+        return self.residual()
+
+    def can_terminate(self) -> bool:
+        """Return whether the iterate may be a minimum if it is stationary."""
+        return self._prepared.method.can_terminate(self._step, DescentPoint(self.positions, self._gradient))
+
+
+def build_newton_arrays(objective: FixedObjective, unpinned_trace: float, norm: ResidualNorm) -> NewtonArrays | None:
+    """Build the arrays of compiled iterations; return None if they are not supported.
+
+    Energies other than springs and quadratic forms are not supported.
+
+    Args:
+        objective: objective of the system, perhaps without barriers.
+        unpinned_trace: trace of the unpinned part of Q [N/m].
+        norm: norm of residuals.
+    """
+    if objective.element_energy_indices or objective.other_energy_indices:
+        return None
+    matrix, n = objective.hessian_matrix, objective.system.num_vertices
+    vectors = np.zeros((3, n, 3))
+    return NewtonArrays(
+        objective.objective_terms,
+        objective.quadratic_form or QuadraticForm.empty_form(),
+        matrix.block_indices,
+        matrix.constant_blocks,
+        np.empty(0),
+        matrix.values,
+        matrix.factor.kernel_factor,
+        unpinned_trace,
+        norm,
+        np.empty((len(objective.system.free_vertices), 3)),
+        *vectors,
+    )
+
+
 class NewtonIteration:
-    """The iteration of Newton's method for one system."""
+    """The iteration of Newton's method for one system.
+
+    Attributes:
+        regularises_by_schedule: whether Hessians without a factor are changed by the shift schedule.
+    """
 
     can_identify_saddles: ClassVar[bool] = True
 
@@ -127,6 +264,7 @@ class NewtonIteration:
         """
         self._has_local_roundoff = has_local_roundoff
         self._metric, self._modification_rule = metric, REGULARISATION_RULES[indefinite]
+        self.regularises_by_schedule = indefinite == "shift-schedule"
         self._system_diagonal: NDArray[np.float64] = np.repeat(metric.free_diagonal, 3)
         self._friction_search = make_friction_search(metric)
 

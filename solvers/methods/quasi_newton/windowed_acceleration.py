@@ -18,12 +18,12 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from springbench.solvers.contact.half_space.vertex_contact import without_vertex_contact
 from springbench.solvers.iteration.idle_contact import skip_idle_contact
-from springbench.solvers.iteration.iterative_solver import IterativeSolver, compute_max_coordinate
+from springbench.solvers.iteration.iterative_solver import CompiledState, IterativeSolver, compute_max_coordinate
 from springbench.solvers.jit.typed_kernel import TypedKernel, as_kernel_array
 from springbench.solvers.kernels import step_setup
 from springbench.solvers.kernels.accelerated_descent import AccelerationWindow
 from springbench.solvers.kernels.acceleration_coefficients import require_history_size
-from springbench.solvers.kernels.iteration_loop import NO_ITERATIONS, ONE_ITERATION, LoopLimits
+from springbench.solvers.kernels.iteration_loop import LoopLimits
 from springbench.solvers.kernels.padding_coordinate import PADDING_COORDINATE
 from springbench.solvers.kernels.spring_objective import ObjectiveWeights
 from springbench.solvers.linalg.memory import allocate_aligned
@@ -241,7 +241,7 @@ AccelerationMemory = tuple[accelerated_step.AcceleratedStep, AccelerationWindow,
 """Work arrays of a solve; an engine may add others."""
 
 
-class CompiledAccelerationState(AcceleratedState):
+class CompiledAccelerationState(CompiledState, AcceleratedState):
     """State of a compiled solve, whose work arrays return to the engine."""
 
     def __init__(self, engine: CompiledEngine, problem: StepProblem, guess: Positions) -> None:
@@ -285,14 +285,6 @@ class CompiledAccelerationState(AcceleratedState):
     def run_iterations(self, limits: LoopLimits) -> tuple[int, float, int]:
         """Run iterations within the limits; return count, residual and reason."""
         return self._engine.run_solve.call(*self._state, limits, self.positions)
-
-    def step_state(self) -> bool:
-        """Do one iteration; return False if round-off prevents any further change."""
-        return self.run_iterations(ONE_ITERATION)[0] == 1
-
-    def residual(self) -> float:
-        """Return the residual [J^(1/2)] at the iterate."""
-        return self.run_iterations(NO_ITERATIONS)[1]
 
     @property
     def objective_decrease(self) -> float:
