@@ -42,8 +42,9 @@ def apply_exact_pins(p: Positions, problem: StepProblem) -> Positions:
         problem: the step, with pins and targets.
     """
     out = np.array(p, np.float64, order="C")
-    exact = problem.system.pins.exact_mask
-    out[problem.system.pins.vertices[exact]] = problem.pin_targets[exact]
+    indices, vertices = problem.system.exact_pins
+    if len(vertices):
+        out[vertices] = problem.pin_targets[indices]
     return out
 
 

@@ -110,6 +110,30 @@ def predict_positions(inertia_diagonal, target, force, pinned_vertices, pin_targ
             out[pinned_vertices[q], c] = pin_targets[q, c]
 
 
+@jit_kernel
+def sum_constant_forces(inertia_diagonal, pinned_vertices, pin_weight, target, force, pin_targets, out):
+    """Write the terms of the negative gradient that are constant in a step.
+
+    They are h target + f + w p_pin.
+
+    Args:
+        inertia_diagonal: inertia h (n,) [N/m].
+        pinned_vertices: vertices of all pins (q,).
+        pin_weight: weight of each pin (q,) [N/m]; exact pins, of infinite weight, are omitted.
+        target: inertial target (n, 3) [m].
+        force: external force (n, 3) [N].
+        pin_targets: targets of all pins (q, 3) [m].
+        out: output (n, 3) [N], overwritten.
+    """
+    for v in range(len(out)):
+        for c in range(3):
+            out[v, c] = inertia_diagonal[v] * target[v, c] + force[v, c]
+    for q in range(len(pinned_vertices)):
+        if pin_weight[q] < np.inf:
+            for c in range(3):
+                out[pinned_vertices[q], c] += pin_weight[q] * pin_targets[q, c]
+
+
 @jit_inner
 def spring_direction(terms, e, p):
     """Return the unit direction of a spring and its length [m].

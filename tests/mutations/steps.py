@@ -82,9 +82,9 @@ _TABLE = (
     ),
     (
         "force-in-right",
-        "solvers/methods/local_global/prefactored.py",
-        "y = s.inertia_diagonal[:, None] * problem.inertial_target + problem.external_force",
-        "y = s.inertia_diagonal[:, None] * problem.inertial_target - problem.external_force",
+        "solvers/kernels/objective_kernels.py",
+        "out[v, c] = inertia_diagonal[v] * target[v, c] + force[v, c]",
+        "out[v, c] = inertia_diagonal[v] * target[v, c] - force[v, c]",
         f"{_U}/test_local_global.py",
     ),
     (

@@ -20,7 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -99,8 +99,7 @@ class Admm:
         )
 
 
-@dataclass(frozen=True, eq=False)
-class _ProjectedEdges:
+class _ProjectedEdges(NamedTuple):
     """Edges of all springs and strain limits, with the lengths of zero energy.
 
     Attributes:
@@ -137,6 +136,7 @@ class PreparedAdmm(IterativeSolver):
         local_global: the factorised ADMM matrix.
         residual_metric: Q with its factor, for residuals.
         project_edges: the kernel of the local step.
+        has_lagged_limits: whether strain limits change from step to step.
     """
 
     def __init__(
@@ -156,6 +156,7 @@ class PreparedAdmm(IterativeSolver):
         )
         self.description, self.stats = base.description, base.stats
         self.project_edges = TypedKernel(run_admm_local_step)
+        self.has_lagged_limits = any(isinstance(e, StrainLimits) and is_lagged(e) for e in objective.system.energies)
 
     def init_state(self, problem: StepProblem, initial_guess: Positions) -> SolverState:
         """Start a solve from an initial guess.
@@ -183,30 +184,21 @@ class _AdmmState(SolverState):
             prepared.residual_metric,
             prepared.projected_edges,
         )
-        if any(isinstance(energy, StrainLimits) and is_lagged(energy) for energy in problem.system.energies):
+        if prepared.has_lagged_limits:
             edges = _ProjectedEdges.from_energies(problem.energies)
-        self._edges = (
-            edges.edges,
-            edges.stiffness,
-            edges.min_length,
-            edges.max_length,
-            edges.rest_direction,
-            prepared.penalty_weight,
-        )
-        self._project_edges = prepared.project_edges
+        self._edges, self._penalty_weight, self._project_edges = edges, prepared.penalty_weight, prepared.project_edges
         self._step = StepObjective(prepared.fixed_objective, problem)
         self._constant_term = self._local_global.constant_right_hand_side(problem)
-        for energy in problem.energies:
-            if isinstance(energy, Quadratic):
-                energy.add_projection(problem.inertial_target, self._constant_term)
+        for k in prepared.fixed_objective.forms_with_force:
+            form: Any = problem.energies[k]
+            form.add_projection(problem.inertial_target, self._constant_term)
         self.positions = vertex_terms.apply_exact_pins(guess, problem)
         self._right_hand_side, self._scaled_dual = np.empty_like(self.positions), np.zeros((len(edges.edges), 3))
 
     def step_state(self) -> bool:
         """Do one iteration; return True."""
-        self._project_edges.call(
-            *self._edges, self.positions, self._constant_term, self._scaled_dual, self._right_hand_side
-        )
+        vectors = self.positions, self._constant_term, self._scaled_dual, self._right_hand_side
+        self._project_edges.call(*self._edges, self._penalty_weight, *vectors)
         self._local_global.solve_correction(self._right_hand_side, self.positions)
         return True
 
@@ -217,7 +209,7 @@ class _AdmmState(SolverState):
         """
         gradient = self._step.gradient(self.positions)
         return self._residual_metric.correction_residual(
-            self._residual_metric.solve_correction(gradient, np.zeros_like(gradient))
+            self._residual_metric.solve_correction(gradient, np.empty_like(gradient))
         )
 
 

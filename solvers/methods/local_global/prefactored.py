@@ -7,12 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from math import sqrt
 from typing import ClassVar
 
 import numpy as np
 from scipy.sparse import csr_array
 from springbench.solvers.iteration import vertex_terms
 from springbench.solvers.iteration.iterative_solver import IterativeSolver, SolverState, compute_max_coordinate
+from springbench.solvers.kernels import objective_kernels, quadratic_form_kernels
 from springbench.solvers.linalg.direct_solvers import DenseCholesky, LinearSolver
 from springbench.solvers.model import system_matrix_assembly
 from springbench.solvers.model.energies.spring_energy import Springs
@@ -113,12 +115,12 @@ class PreparedLocalGlobal(IterativeSolver):
 
     def constant_right_hand_side(self, problem: StepProblem) -> Positions:
         """Return y, with the exact pins' columns of Q moved to the right-hand side."""
-        s = self.system
-        y = s.inertia_diagonal[:, None] * problem.inertial_target + problem.external_force
-        soft, vertices, weight = s.penalty_pins
-        y[vertices] += weight[:, None] * problem.pin_targets[soft]
-        if s.pins.exact_mask.any():
-            y[s.free_vertices] -= self.pin_coupling @ problem.pin_targets[s.pins.exact_mask]
+        s, y = self.system, np.empty(problem.inertial_target.shape)
+        step_arrays = problem.inertial_target, problem.external_force, problem.pin_targets
+        objective_kernels.sum_constant_forces(s.inertia_diagonal, s.pins.vertices, s.pins.weight, *step_arrays, y)
+        exact, _ = s.exact_pins
+        if len(exact):
+            y[s.free_vertices] -= self.pin_coupling @ problem.pin_targets[exact]
         return y
 
     def solve_correction(self, b: Positions, out: Positions) -> Positions:
@@ -271,7 +273,7 @@ def prepare_local_global(
         _build_local_step(energies),
         factor,
         csr_array(rows[:, exact]),
-        lambda e: system_matrix_assembly.energy_norm(Q, e),
+        _build_energy_norm(Q),
         float(Q.diagonal()[system.unpinned_mask].sum()),
         collect_factor_stats(Q.nnz, factor),
         choice,
@@ -279,6 +281,17 @@ def prepare_local_global(
         inner if is_low_precision else None,
         diagonal_dominance_ratio(inner),
     )
+
+
+def _build_energy_norm(Q: csr_array) -> Callable[[Positions], float]:
+    """Build `system_matrix_assembly.energy_norm` of one matrix, without SciPy's checks of the arguments."""
+
+    def compute_norm(e: Positions) -> float:
+        product = np.empty_like(e)
+        quadratic_form_kernels.multiply_matrix(Q.indptr, Q.indices, Q.data, e, product)
+        return sqrt(max(float(np.einsum("ij,ij->", e, product)), 0.0))  # this order of arguments returns NaN for NaN
+
+    return compute_norm
 
 
 def _build_local_step(energies: Iterable[Energy]) -> LocalStep:
