@@ -275,6 +275,51 @@ class ExactPins(NamedTuple):
     targets: Positions
 
 
+@jit_inner
+def move_to_targets(exact_pins, p):
+    """Move the exactly pinned vertices to their targets.
+
+    Args:
+        exact_pins: the exactly pinned vertices.
+        p: positions (n, 3) [m], updated.
+    """
+    for k in range(len(exact_pins.vertices)):
+        for c in range(3):
+            p[exact_pins.vertices[k], c] = exact_pins.targets[k, c]
+
+
+@jit_inner
+def change_objective(terms, form, step_data, p, q):
+    """Return g(q) - g(p) [J] of springs, a quadratic form and single vertices.
+
+    Args:
+        terms: objective terms.
+        form: quadratic form, or None.
+        step_data: data of the step.
+        p, q: positions (n, 3) [m], before and after.
+    """
+    return _change_objective(terms, step_data, p, q) + change_form(form, p, q)
+
+
+@jit_inner
+def write_free_gradient(terms, form, step_data, exact_pins, p, out):
+    """Write the gradient of springs, a quadratic form and single vertices.
+
+    Args:
+        terms: objective terms.
+        form: quadratic form, or None.
+        step_data: data of the step.
+        exact_pins: exactly pinned vertices.
+        p: positions (n, 3) [m].
+        out: output (n, 3) [N], overwritten; zero at exactly pinned vertices.
+    """
+    _write_gradient(terms, step_data, p, out)
+    add_product(form, p, out)
+    for k in range(len(exact_pins.vertices)):
+        for c in range(3):
+            out[exact_pins.vertices[k], c] = 0.0
+
+
 @jit_kernel
 def try_step(terms, form, step_data, exact_pins, p, direction, step_size, slope, curvature, q, out):
     """Evaluate a line-search trial, and the gradient there if the objective decreases enough.
@@ -297,17 +342,11 @@ def try_step(terms, form, step_data, exact_pins, p, direction, step_size, slope,
     for v in range(len(p)):
         for c in range(3):
             q[v, c] = p[v, c] + step_size * direction[v, c]
-    for k in range(len(exact_pins.vertices)):
-        for c in range(3):
-            q[exact_pins.vertices[k], c] = exact_pins.targets[k, c]
-    change = _change_objective(terms, step_data, p, q) + change_form(form, p, q)
+    move_to_targets(exact_pins, q)
+    change = change_objective(terms, form, step_data, p, q)
     if not is_armijo_step(change, step_size, slope, curvature):
         return change, False
-    _write_gradient(terms, step_data, q, out)
-    add_product(form, q, out)
-    for k in range(len(exact_pins.vertices)):
-        for c in range(3):
-            out[exact_pins.vertices[k], c] = 0.0
+    write_free_gradient(terms, form, step_data, exact_pins, q, out)
     return change, True
 
 

@@ -121,6 +121,11 @@ class FixedObjective:
         self.projective_indices = {k for k, e in energies.items() if isinstance(e, ProjectiveEnergy)}
 
     @property
+    def is_springs_and_forms(self) -> bool:
+        """Whether all energies are springs and quadratic forms."""
+        return not (self.element_energy_indices or self.other_energy_indices)
+
+    @property
     def has_barriers(self) -> bool:
         """Whether any energy is a barrier."""
         return any(is_barrier_energy(self.system.energies[k]) for k in self.other_energy_indices)

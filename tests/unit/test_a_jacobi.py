@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import islice
+
 import numpy as np
 import pytest
 from springbench.harness.scenes.effects.bending_effect import BendingEffect
@@ -9,6 +11,7 @@ from springbench.solvers.iteration.descent_method import ResidualMetric
 from springbench.solvers.methods.local_global.aggregated_jacobi import AggregatedJacobi, AggregatedSweeps
 from springbench.solvers.methods.local_global.prefactored import prepare_local_global, require_projective
 from springbench.solvers.methods.newton.newton_direct import NewtonSolver
+from springbench.solvers.methods.quasi_newton.nonlinear_cg import NonlinearCG
 from springbench.solvers.model.step_problem import StopRule, Unsupported
 
 from tests.effect_scenes import EFFECT_SCENES, build_moving_problem
@@ -70,6 +73,30 @@ def test_more_sweeps_take_fewer_iterations():
         for l in (1, 2, 4)
     )
     assert one > two > four
+
+
+@pytest.mark.parametrize("method", [AggregatedJacobi(), NonlinearCG()], ids=["a-jacobi", "pncg"])
+@pytest.mark.parametrize("scene", ["bending", "attachments"])
+def test_compiled_iterations_are_the_interpreted_ones(method, scene):
+    problem = build_moving_problem(EFFECT_SCENES[scene]())
+    compiled, interpreted = method.prepare(problem.system), method.prepare(problem.system)
+    assert compiled._engine is not None
+    interpreted.__dict__["_engine"] = None
+    for stop in (StopRule(10), StopRule(50, 1e-3)):
+        found, wanted = compiled.solve(problem, stop), interpreted.solve(problem, stop)
+        assert found.num_iterations == wanted.num_iterations
+        np.testing.assert_allclose(found.positions, wanted.positions, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("method", [AggregatedJacobi(), NonlinearCG()], ids=["a-jacobi", "pncg"])
+def test_solves_at_the_same_time_have_separate_work_arrays(method):
+    prepared = method.prepare(HANGING.system)
+    alone = [p.copy() for p in islice(prepared.iterates(HANGING), 4)]
+    one, other = prepared.iterates(HANGING), prepared.iterates(HANGING)
+    for wanted in alone:
+        np.testing.assert_array_equal(next(one), wanted)
+        np.testing.assert_array_equal(next(other), wanted)
+        prepared.solve(HANGING, StopRule(3))
 
 
 @pytest.mark.parametrize(("scene", "name"), [("contact", "HalfSpaceContact"), ("gas", "Gas")], ids=lambda x: x)

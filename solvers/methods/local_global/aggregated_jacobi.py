@@ -25,9 +25,17 @@ from scipy.sparse import csr_array, dia_array
 from springbench.solvers.contact.half_space.vertex_contact import without_vertex_contact
 from springbench.solvers.iteration.iterative_solver import IterativeSolver, SolverState
 from springbench.solvers.iteration.solver_info import Citation, SolverInfo
+from springbench.solvers.jit.typed_kernel import TypedKernel, as_kernel_array
+from springbench.solvers.kernels import quadratic_form_kernels
+from springbench.solvers.kernels.accelerated_descent import AccelerationWindow
 from springbench.solvers.kernels.acceleration_coefficients import CHEBYSHEV_RULE
 from springbench.solvers.linalg.multigrid.smoothed_aggregation import estimate_largest_eigenvalue
-from springbench.solvers.methods.local_global.accelerated_local_global import AccelerationScheme, InterpretedState
+from springbench.solvers.methods.local_global import aggregated_jacobi_kernel
+from springbench.solvers.methods.local_global.accelerated_local_global import (
+    AccelerationScheme,
+    InterpretedState,
+    allocate_window,
+)
 from springbench.solvers.methods.local_global.compiled_local_global import CompiledLocalGlobal
 from springbench.solvers.methods.local_global.prefactored import (
     PreparedLocalGlobal,
@@ -112,7 +120,8 @@ class AggregatedSweeps:
     The sweeps start at x = 0.
 
     Attributes:
-        nonzeros: number of stored entries of the matrix.
+        matrix: the matrix S.
+        nonzeros: number of its stored entries.
     """
 
     def __init__(self, Q: csr_array, sweeps: int) -> None:
@@ -127,15 +136,16 @@ class AggregatedSweeps:
             S = csr_array(S / (1.0 + max(0.0, largest / damped - 1.0) ** sweeps))
         self.matrix = drop_zeros(S)
         self.nonzeros: int | None = int(self.matrix.nnz)
+        self._multiply_matrix = TypedKernel(quadratic_form_kernels.multiply_matrix)
 
     def solve(self, b: Positions, out: Positions) -> None:
         """Compute S b.
 
         Args:
-            b: right-hand side (n, 3).
-            out: result (n, 3), overwritten.
+            b: right-hand side (n, 3), C-contiguous.
+            out: result (n, 3), C-contiguous, overwritten.
         """
-        out[:] = self.matrix @ b
+        self._multiply_matrix.call(self.matrix.indptr, self.matrix.indices, self.matrix.data, b, out)
 
 
 class PreparedAggregatedJacobi(IterativeSolver):
@@ -150,6 +160,11 @@ class PreparedAggregatedJacobi(IterativeSolver):
         self.local_global, self.residual_solver, self.fixed_objective = base, measure, objective
         self.description = f"{base.description}; for the residual alone {measure.description}"
         self.stats = base.stats
+        self._engine = (
+            _CompiledEngine(base.system, base.factor.matrix, objective)
+            if isinstance(base.factor, AggregatedSweeps) and objective.is_springs_and_forms
+            else None
+        )
 
     def init_state(self, problem: StepProblem, initial_guess: Positions) -> SolverState:
         """Start a solve from an initial guess.
@@ -158,7 +173,10 @@ class PreparedAggregatedJacobi(IterativeSolver):
             problem: step whose objective is minimised.
             initial_guess: positions (n, 3) [m], not modified.
         """
-        return _AggregatedJacobiState(self, problem, initial_guess)
+        measure, step = self.residual_solver.build_residual(problem), StepObjective(self.fixed_objective, problem)
+        if self._engine is None:
+            return _InterpretedSweepState(measure, self.local_global, step, initial_guess)
+        return _CompiledSweepState(measure, self._engine, step, initial_guess)
 
     def residual_at(self, problem: StepProblem, p: Positions) -> float:
         """Return the residual [J^(1/2)], measured with the factor of Q.
@@ -181,15 +199,86 @@ class PreparedAggregatedJacobi(IterativeSolver):
         return {"local": lambda: step.gradient(p), "global": lambda: self.local_global.solve_correction(gradient, out)}
 
 
-class _AggregatedJacobiState(InterpretedState):
-    """State of an A-Jacobi solve; the residual is measured with the factor of Q."""
+class _InterpretedSweepState(InterpretedState):
+    """State of an interpreted solve; residuals are measured with the factor of Q."""
 
-    def __init__(self, prepared: PreparedAggregatedJacobi, problem: StepProblem, guess: Positions) -> None:
-        super().__init__(
-            prepared.local_global, _A_JACOBI_SCHEME, StepObjective(prepared.fixed_objective, problem), guess
-        )
-        self._compute_residual = prepared.residual_solver.build_residual(problem)
+    def __init__(
+        self, measure: Callable[[Positions], float], base: PreparedLocalGlobal, step: StepObjective, guess: Positions
+    ) -> None:
+        super().__init__(base, _A_JACOBI_SCHEME, step, guess)
+        self._compute_residual = measure
+
+    def compute_start_residual(self) -> float:
+        """Return the residual at the initial guess [J^(1/2)]."""
+        return self.residual()
 
     def residual(self) -> float:
         """Return the residual [J^(1/2)] at the iterate."""
         return self._compute_residual(self.positions)
+
+
+class _CompiledEngine:
+    """Compiled iterations for springs and quadratic forms, with the work arrays of solves."""
+
+    def __init__(self, system: System, S: csr_array, objective: FixedObjective) -> None:
+        free, self._num_vertices = system.free_vertices, system.num_vertices
+        pointers = np.zeros(self._num_vertices + 1, S.indptr.dtype)
+        pointers[free + 1] = np.diff(S.indptr)
+        columns = free.astype(S.indices.dtype)[S.indices]
+        self._sweep_matrix = aggregated_jacobi_kernel.SweepMatrix(
+            np.cumsum(pointers, dtype=pointers.dtype), columns, S.data
+        )
+        self._objective_arguments = objective.objective_terms, objective.quadratic_form
+        self.free_memory: list[_Memory] = []
+        self.start_jacobi_solve, self.run_jacobi_solve = (
+            TypedKernel(aggregated_jacobi_kernel.start_jacobi_solve),
+            TypedKernel(aggregated_jacobi_kernel.run_jacobi_solve),
+        )
+
+    def _allocate_memory(self) -> _Memory:
+        size = 3 * self._num_vertices
+        window, correction = allocate_window(_A_JACOBI_SCHEME, size, size), np.zeros(size)
+        views = (x.reshape(-1, 3) for x in (window.position, window.trial_position, window.trial_descent, correction))
+        return aggregated_jacobi_kernel.SweepVectors(*views, correction_entries=correction), window
+
+    def build_step(self, step: StepObjective) -> aggregated_jacobi_kernel.JacobiStep:
+        """Build the arguments of the kernels for a step, with work arrays of their own."""
+        memory = self.free_memory.pop() if self.free_memory else self._allocate_memory()
+        return aggregated_jacobi_kernel.JacobiStep(
+            *self._objective_arguments, step.step_data, step.exact_pins, self._sweep_matrix, *memory
+        )
+
+
+_Memory = tuple[aggregated_jacobi_kernel.SweepVectors, AccelerationWindow]
+"""Work arrays of a solve."""
+
+
+class _CompiledSweepState(SolverState):
+    """State of a compiled solve, whose work arrays return to the engine."""
+
+    def __init__(
+        self, measure: Callable[[Positions], float], engine: _CompiledEngine, step: StepObjective, guess: Positions
+    ) -> None:
+        self._compute_residual, self._engine = measure, engine
+        self._step = engine.build_step(step)
+        engine.start_jacobi_solve.call(self._step, as_kernel_array(guess))
+        self.positions = step.apply_exact_pins(guess)
+
+    def step_state(self) -> bool:
+        """Do one iteration; return False if round-off prevents descent."""
+        return self.run_unchecked(1) == 1
+
+    def run_unchecked(self, num_iterations: int) -> int:
+        """Do iterations up to the first that fails; return how many succeeded."""
+        return self._engine.run_jacobi_solve.call(self._step, num_iterations, self.positions)
+
+    def compute_start_residual(self) -> float:
+        """Return the residual at the initial guess [J^(1/2)]."""
+        return self.residual()
+
+    def residual(self) -> float:
+        """Return the residual [J^(1/2)] at the iterate."""
+        return self._compute_residual(self.positions)
+
+    def __del__(self) -> None:
+        self._engine.free_memory.append((self._step.vectors, self._step.window))

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
@@ -35,6 +36,8 @@ from springbench.solvers.iteration.preconditioners import (
     build_preconditioner,
 )
 from springbench.solvers.iteration.solver_info import Citation, SolverInfo
+from springbench.solvers.jit.typed_kernel import TypedKernel
+from springbench.solvers.methods.quasi_newton import nonlinear_cg_kernel
 from springbench.solvers.model.step_problem import Positions, PreparedSolver, StepProblem, System, Unsupported
 from springbench.solvers.objective.fixed_objective import FixedObjective
 from springbench.solvers.objective.step_objective import StepObjective
@@ -82,7 +85,12 @@ class NonlinearCG:
         metric, objective = ResidualMetric(system), FixedObjective(system)
         at = build_preconditioner(self.preconditioner, metric, objective, "pncg")
         found = PreparedNonlinearCG(
-            metric, objective, at, metric.description + objective.interpreted_energies, metric.stats
+            metric,
+            objective,
+            at,
+            metric.description + objective.interpreted_energies,
+            metric.stats,
+            self.preconditioner,
         )
         return skip_idle_contact(found, system, lambda: replace(found, fixed_objective=objective.ignore_barriers()))
 
@@ -96,6 +104,7 @@ class PreparedNonlinearCG(IterativeSolver):
     linearise_at: PreconditionerBuilder
     description: str
     stats: dict[str, float]
+    preconditioner: PreconditionerName
 
     def init_state(self, problem: StepProblem, initial_guess: Positions) -> SolverState:
         """Start a solve from an initial guess.
@@ -104,9 +113,16 @@ class PreparedNonlinearCG(IterativeSolver):
             problem: step whose objective is minimised.
             initial_guess: positions (n, 3) [m], not modified.
         """
-        return _NonlinearCGState(
-            self.metric, self.linearise_at, StepObjective(self.fixed_objective, problem), initial_guess
-        )
+        step = StepObjective(self.fixed_objective, problem)
+        if self._engine is None:
+            return _NonlinearCGState(self.metric, self.linearise_at, step, initial_guess)
+        return _CompiledState(self._engine, step, initial_guess)
+
+    @cached_property
+    def _engine(self) -> _CompiledEngine | None:
+        """The compiled iterations; None for other preconditioners and energies than they support."""
+        is_compiled = self.preconditioner == "cholesky" and self.fixed_objective.is_springs_and_forms
+        return _CompiledEngine(self.metric, self.fixed_objective) if is_compiled else None
 
     def residual_scale(self, problem: StepProblem) -> float:
         """Return the residual scale [J^(1/2)] for the round-off check."""
@@ -124,8 +140,70 @@ class PreparedNonlinearCG(IterativeSolver):
         }
 
 
+class _CompiledEngine:
+    """Compiled iterations with springs, quadratic forms and the preconditioner Q^-1.
+
+    Attributes:
+        metric: factorised Q.
+        free_memory: work arrays of solves that have ended.
+        start_conjugate_solve, search_along_conjugate: the kernels.
+    """
+
+    def __init__(self, metric: ResidualMetric, objective: FixedObjective) -> None:
+        self.metric, self._objective_terms, self._form = metric, objective.objective_terms, objective.quadratic_form
+        self.free_memory: list[nonlinear_cg_kernel.SearchVectors] = []
+        self.start_conjugate_solve, self.search_along_conjugate = (
+            TypedKernel(nonlinear_cg_kernel.start_conjugate_solve),
+            TypedKernel(nonlinear_cg_kernel.search_along_conjugate),
+        )
+
+    def build_step(self, step: StepObjective, p: Positions) -> nonlinear_cg_kernel.SearchStep:
+        """Build the arguments of the kernels, with work arrays of their own.
+
+        Args:
+            step: the objective.
+            p: positions (n, 3) [m] at the start, which the kernels update.
+        """
+        vectors = (
+            self.free_memory.pop()
+            if self.free_memory
+            else nonlinear_cg_kernel.SearchVectors.from_counts(len(p), len(self._objective_terms.stiffness))
+        )
+        fixed = self._objective_terms, self._form, step.step_data, step.exact_pins, self.metric.unpinned_trace
+        return nonlinear_cg_kernel.SearchStep(*fixed, p, vectors)
+
+
+class _CompiledState(SolverState):
+    """State of a compiled solve, whose work arrays return to the engine."""
+
+    def __init__(self, engine: _CompiledEngine, step: StepObjective, guess: Positions) -> None:
+        self._engine, self.positions = engine, step.apply_exact_pins(guess)
+        self._step = engine.build_step(step, self.positions)
+        self._gradient = self._step.vectors.gradient
+        engine.start_conjugate_solve.call(self._step)
+        self._correction = engine.metric.solve(self._gradient)
+
+    def step_state(self) -> bool:
+        """Do one iteration; return False if round-off prevents any further change."""
+        if not self._engine.search_along_conjugate.call(self._step, self._correction):
+            return False
+        self._correction = self._engine.metric.solve(self._gradient)
+        return True
+
+    def compute_start_residual(self) -> float:
+        """Return the residual at the initial guess [J^(1/2)]."""
+        return self.residual()
+
+    def residual(self) -> float:
+        """Return the residual [J^(1/2)] at the iterate."""
+        return self._engine.metric.correction_norm(self._correction.copy(), self._gradient)
+
+    def __del__(self) -> None:
+        self._engine.free_memory.append(self._step.vectors)
+
+
 class _NonlinearCGState(SolverState):
-    """State of a solve: the current point, and the direction that led to it."""
+    """State of an interpreted solve: the current point, and the direction that led to it."""
 
     def __init__(
         self, metric: ResidualMetric, linearise_at: PreconditionerBuilder, step: StepObjective, guess: Positions
@@ -173,6 +251,10 @@ class _NonlinearCGState(SolverState):
         if not (slope < 0.0 < curvature):
             return None
         return backtracking_line_search(self._step, self._current_point, direction, initial_step=-slope / curvature)
+
+    def compute_start_residual(self) -> float:
+        """Return the residual at the initial guess [J^(1/2)]."""
+        return self.residual()
 
     def residual(self) -> float:
         """Return the residual [J^(1/2)] at the iterate."""
