@@ -12,21 +12,29 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from typing import ClassVar, NamedTuple, Protocol
+from typing import Any, ClassVar, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
-from springbench.solvers.iteration.iterative_solver import IterativeSolver, SolverState, compute_max_coordinate
+from springbench.solvers.iteration.iterative_solver import (
+    CompiledState,
+    IterativeSolver,
+    SolverState,
+    compute_max_coordinate,
+)
 from springbench.solvers.jit.typed_kernel import TypedKernel, as_kernel_array
 from springbench.solvers.kernels import objective_kernels
+from springbench.solvers.kernels.descent_search import SearchArrays
+from springbench.solvers.kernels.iteration_loop import LoopLimits
 from springbench.solvers.kernels.line_search_conditions import (
     ARMIJO_FRACTION,
     MAX_HALVINGS,
     is_approximate_wolfe_step,
     is_armijo_step,
 )
+from springbench.solvers.kernels.quadratic_form_kernels import QuadraticForm
 from springbench.solvers.kernels.residual_norm import NormMatrix, ResidualNorm, compute_correction_norm
 from springbench.solvers.linalg.cholesky.supernodal_cholesky import SupernodalCholesky, embed_factor
 from springbench.solvers.linalg.dense_inverse import DenseInverse
@@ -291,13 +299,25 @@ class ResidualMetric:
             return SupernodalCholesky(self.free_block)
         return self.factor if isinstance(self.factor, SupernodalCholesky) else None
 
-    @cached_property
-    def kernel_norm(self) -> ResidualNorm | None:
-        """The norm for kernels, in one thread; None if they do not support the factor."""
-        if self.supernodal_factor is None:
+    @property
+    def is_threaded(self) -> bool:
+        """Whether solves with Q use several threads."""
+        return self.supernodal_factor is not None and self.supernodal_factor.choose_num_threads() is not None
+
+    def build_search_arrays(self, objective: FixedObjective) -> SearchArrays | None:
+        """Build the arrays of a compiled method, or return None if it is not supported.
+
+        It has one thread. Kernels support springs and quadratic forms, and supernodal factors.
+
+        Args:
+            objective: objective of the system, perhaps without barriers.
+        """
+        if self.supernodal_factor is None or not objective.is_springs_and_forms:
             return None
-        factor = embed_factor(self.supernodal_factor, self.system.free_vertices)
-        return ResidualNorm(self._norm_matrix, factor, np.zeros((self.system.num_vertices, 3)))
+        form, free = objective.quadratic_form or QuadraticForm.empty_form(), self.system.free_vertices
+        correction, *trial = np.zeros((3, self.system.num_vertices, 3))
+        norm = ResidualNorm(self._norm_matrix, embed_factor(self.supernodal_factor, free), correction)
+        return SearchArrays(objective.objective_terms, form, self.unpinned_trace, norm, *trial)
 
 
 @dataclass(frozen=True, eq=False)
@@ -382,3 +402,39 @@ class _DescentState(SolverState):
     def can_terminate(self) -> bool:
         """Return whether the iterate may be a minimum if it is stationary."""
         return self._method.can_terminate(self._step, self._point)
+
+
+class CompiledDescentState(CompiledState):
+    """The state of a solve by a compiled method of springs and quadratic forms.
+
+    Attributes:
+        gradient: gradient at the positions (n, 3) [N].
+        progress: progress of the solve, of a type of the method (1,).
+    """
+
+    def __init__(
+        self, run: TypedKernel, arrays: Any, step: StepObjective, start: DescentPoint, num_vectors: int, dtype: np.dtype
+    ) -> None:
+        """Prepare a solve, which the first call of the kernel starts.
+
+        Args:
+            run: kernel of the iteration loop.
+            arrays: its arrays of the system.
+            step: the objective.
+            start: first point, whose arrays are overwritten.
+            num_vectors: number of vectors (n, 3) that the kernel carries from iteration to iteration.
+            dtype: type of the progress.
+        """
+        self._step, self._kernel = step, run
+        self.positions, self.gradient, self.progress = start.positions, start.gradient, np.zeros(1, dtype)
+        self._fixed_arguments = arrays, step.step_data, step.exact_pins
+        self._vectors = np.zeros((num_vectors, *self.positions.shape))
+
+    def run_iterations(self, limits: LoopLimits) -> tuple[int, float, int]:
+        """Iterate up to the limits; return count, residual and reason."""
+        vectors = self.positions, self.gradient, *self._vectors
+        return self._kernel.call(*self._fixed_arguments, limits, *vectors, self.progress)
+
+    def compute_start_residual(self) -> float:
+        """Return the residual at the initial guess [J^(1/2)]."""
+        return self.residual()

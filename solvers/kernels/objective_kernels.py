@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from springbench.solvers.jit.kernel_compilation import jit_inner, jit_kernel
 from springbench.solvers.jit.typed_kernel import as_kernel_array
-from springbench.solvers.kernels.line_search_conditions import MAX_HALVINGS, is_armijo_step
+from springbench.solvers.kernels.line_search_conditions import is_armijo_step
 from springbench.solvers.kernels.quadratic_form_kernels import add_product, change_form
 from springbench.solvers.kernels.spring_law import spring_energy_change, unit_direction
 from springbench.solvers.model.energies.spring_energy import Springs
@@ -348,31 +348,6 @@ def try_step(terms, form, step_data, exact_pins, p, direction, step_size, slope,
         return change, False
     write_free_gradient(terms, form, step_data, exact_pins, q, out)
     return change, True
-
-
-@jit_inner
-def search_backtracking(terms, form, step_data, exact_pins, p, direction, slope, q, out):
-    """Find the first of the step sizes 1, 1/2, ... at which the objective decreases enough.
-
-    Args:
-        terms: objective terms.
-        form: quadratic form, or None.
-        step_data: data of the step.
-        exact_pins: exactly pinned vertices, which are moved to their targets.
-        p: current positions (n, 3) [m].
-        direction: search direction (n, 3) [m].
-        slope: derivative along the direction [J].
-        q, out: output, positions (n, 3) [m] and gradient (n, 3) [N] there.
-
-    Returns:
-        Whether there is one; if not, q is not lower than p, and `out` is not written.
-    """
-    step_size = 1.0
-    for _ in range(MAX_HALVINGS if slope < 0.0 else 0):
-        if try_step(terms, form, step_data, exact_pins, p, direction, step_size, slope, 0.0, q, out)[1]:
-            return True
-        step_size *= 0.5
-    return False
 
 
 @jit_inner

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,8 +23,8 @@ class NormMatrix(NamedTuple):
     """
 
     pinned_vertices: NDArray[np.int64]
-    pointers: NDArray[np.int32]
-    columns: NDArray[np.int32]
+    pointers: NDArray[Any]
+    columns: NDArray[Any]
     values: NDArray[np.float64]
     product: NDArray[np.float64]
 
@@ -72,4 +72,19 @@ def compute_residual_norm(norm, gradient):
         gradient: gradient (n, 3) [N].
     """
     solve_supernodal(norm.factor, gradient, norm.correction, None)
+    return compute_correction_norm(norm.matrix, norm.correction, gradient)
+
+
+@jit_inner
+def compute_norm_of_correction(norm, correction, gradient):
+    """Return the norm of a residual, of a known correction Q^-1 g.
+
+    Args:
+        norm: the norm.
+        correction: correction (n, 3) [m], not modified.
+        gradient: gradient g (n, 3) [N].
+    """
+    for v in range(len(correction)):
+        for c in range(3):
+            norm.correction[v, c] = correction[v, c]
     return compute_correction_norm(norm.matrix, norm.correction, gradient)

@@ -18,6 +18,7 @@ from typing import ClassVar
 
 import numpy as np
 from springbench.solvers.iteration.descent_method import (
+    CompiledDescentState,
     DescentPoint,
     PreparedDescent,
     ResidualMetric,
@@ -26,7 +27,7 @@ from springbench.solvers.iteration.descent_method import (
 )
 from springbench.solvers.iteration.device_interface import PrecisionOptions
 from springbench.solvers.iteration.idle_contact import skip_idle_contact
-from springbench.solvers.iteration.iterative_solver import CompiledState, SolverState
+from springbench.solvers.iteration.iterative_solver import SolverState
 from springbench.solvers.iteration.preconditioners import (
     Preconditioner,
     PreconditionerName,
@@ -35,8 +36,8 @@ from springbench.solvers.iteration.preconditioners import (
 )
 from springbench.solvers.iteration.solver_info import Citation, SolverInfo
 from springbench.solvers.jit.typed_kernel import TypedKernel
-from springbench.solvers.kernels.iteration_loop import LoopLimits
-from springbench.solvers.kernels.quadratic_form_kernels import QuadraticForm
+from springbench.solvers.kernels.descent_search import SearchArrays
+from springbench.solvers.linalg.cholesky.supernodal_cholesky import embed_factor
 from springbench.solvers.linalg.krylov import NEGATIVE_CURVATURE, ConjugateGradientIteration
 from springbench.solvers.methods.newton import newton_cg_kernel
 from springbench.solvers.methods.newton.newton_cg_kernel import (
@@ -119,7 +120,7 @@ class TruncatedNewtonIteration:
         self, metric: ResidualMetric, objective: FixedObjective, preconditioner: PreconditionerName = "cholesky"
     ) -> None:
         self._metric, self._linearise_at = metric, build_preconditioner(preconditioner, metric, objective, "newton-cg")
-        is_compiled = preconditioner == "cholesky" and metric.kernel_norm is not None
+        is_compiled = preconditioner == "cholesky" and metric.supernodal_factor is not None
         self.compiled_cg = CompiledCG(metric) if is_compiled else None
         self._friction_search = make_friction_search(metric)
 
@@ -269,36 +270,25 @@ class CompiledCG:
         Args:
             metric: norm of residuals, whose factor kernels support.
         """
-        factor, norm, system = metric.supernodal_factor, metric.kernel_norm, metric.system
+        factor, system = metric.supernodal_factor, metric.system
         assert factor is not None
-        assert norm is not None
-        self._thread_count, self._factor = factor.choose_num_threads, norm.factor
+        self._thread_count, self._factor = factor.choose_num_threads, embed_factor(factor, system.free_vertices)
         self._exact_pins = system.pins.vertices[system.pins.exact_mask]
         self._scratch = np.zeros((4, system.num_vertices, 3))
         self._solve_usual = TypedKernel(newton_cg_kernel.solve_direction)
         self.run_newton_cg = TypedKernel(newton_cg_kernel.run_newton_cg)
-        self._metric, self._norm = metric, norm
 
-    def build_arrays(self, objective: FixedObjective) -> NewtonCGArrays | None:
-        """Build the arrays of compiled iterations; return None if they are not supported.
+    def build_arrays(self, search: SearchArrays) -> NewtonCGArrays:
+        """Build the arrays of compiled iterations in one thread.
 
         Args:
-            objective: objective of the system, perhaps without barriers.
+            search: arrays of the system.
         """
-        if objective.element_energy_indices or objective.other_energy_indices:
-            return None
-        size = objective.system.num_vertices, 3
-        terms, form = objective.objective_terms, objective.quadratic_form or QuadraticForm.empty_form()
-        linear = np.empty((len(terms.stiffness), 4))
+        linear = np.empty((len(search.objective_terms.stiffness), 4))
+        hessian = search.objective_terms, linear, search.quadratic_form, None, None
         solving = self._factor, None, self._exact_pins, None
-        equation = NewtonEquation((terms, linear, form, None, None), *solving, np.zeros(size), *self._scratch)
-        trial = np.empty((2, *size))
-        return NewtonCGArrays(terms, form, linear, equation, self._metric.unpinned_trace, self._norm, *trial)
-
-    @property
-    def is_threaded(self) -> bool:
-        """Whether solves with Q use several threads."""
-        return self._thread_count() is not None
+        d = np.zeros_like(search.trial_positions)
+        return NewtonCGArrays(search, linear, NewtonEquation(hessian, *solving, d, *self._scratch))
 
     def compute_direction(
         self, hessian: Hessian, solve: Preconditioner, at: DescentPoint, descent: Positions, eta: float
@@ -337,7 +327,8 @@ class PreparedTruncatedNewton(PreparedDescent):
     @cached_property
     def compiled_arrays(self) -> NewtonCGArrays | None:
         """Arrays of compiled iterations in one thread, or None if they are not supported."""
-        return self.method.compiled_cg and self.method.compiled_cg.build_arrays(self.fixed_objective)
+        compiled, search = self.method.compiled_cg, self.metric.build_search_arrays(self.fixed_objective)
+        return compiled.build_arrays(search) if compiled and search else None
 
     def init_state(self, problem: StepProblem, initial_guess: Positions) -> SolverState:
         """Start a solve.
@@ -347,24 +338,7 @@ class PreparedTruncatedNewton(PreparedDescent):
             initial_guess: positions (n, 3) [m], which are not modified.
         """
         compiled, arrays = self.method.compiled_cg, self.compiled_arrays
-        if compiled is None or arrays is None or compiled.is_threaded:
+        if compiled is None or arrays is None or self.metric.is_threaded:
             return super().init_state(problem, initial_guess)
-        return _CompiledNewtonCGState(compiled.run_newton_cg, arrays, *self._build_step(problem, initial_guess))
-
-
-class _CompiledNewtonCGState(CompiledState):
-    """The state of a solve with compiled iterations."""
-
-    def __init__(self, run: TypedKernel, arrays: NewtonCGArrays, step: StepObjective, start: DescentPoint) -> None:
-        self._run, self._arrays, self._step_arrays = run, arrays, (step.step_data, step.exact_pins)
-        self.positions, self._gradient, self._descent = *start[:2], np.zeros_like(start.gradient)
-        self._progress = np.zeros(1, NEWTON_CG_PROGRESS_DTYPE)
-
-    def compute_start_residual(self) -> float:
-        """Return the residual at the initial guess [J^(1/2)]."""
-        return self.residual()
-
-    def run_iterations(self, limits: LoopLimits) -> tuple[int, float, int]:
-        """Iterate up to the limits; return count, residual and reason."""
-        point = self.positions, self._gradient, self._descent
-        return self._run.call(self._arrays, *self._step_arrays, limits, *point, self._progress)
+        step, start = self._build_step(problem, initial_guess)
+        return CompiledDescentState(compiled.run_newton_cg, arrays, step, start, 1, NEWTON_CG_PROGRESS_DTYPE)

@@ -15,19 +15,18 @@ import numpy as np
 from numba.extending import register_jitable
 from numpy.typing import NDArray
 from springbench.solvers.jit.kernel_compilation import jit_inner, jit_inner_options, jit_kernel
-from springbench.solvers.kernels.iteration_loop import build_compiled_loop
-from springbench.solvers.kernels.objective_kernels import (
-    ObjectiveTerms,
-    compute_inner_product,
-    compute_max_magnitude,
+from springbench.solvers.kernels.descent_search import (
+    SearchArrays,
+    exceeds_roundoff,
+    move_to_trial,
     search_backtracking,
 )
-from springbench.solvers.kernels.quadratic_form_kernels import QuadraticForm
-from springbench.solvers.kernels.residual_norm import ResidualNorm, compute_correction_norm
+from springbench.solvers.kernels.iteration_loop import build_compiled_loop
+from springbench.solvers.kernels.objective_kernels import compute_inner_product
+from springbench.solvers.kernels.residual_norm import compute_norm_of_correction
 from springbench.solvers.kernels.spring_hessian import linearise_springs, multiply_hessian
 from springbench.solvers.linalg.cholesky.triangular_solve import SupernodalFactor, solve_supernodal
 from springbench.solvers.linalg.krylov import NEGATIVE_CURVATURE, compile_cg_loop
-from springbench.solvers.model.rounding_bound import EPS
 
 MAX_ETA, MIN_ETA = 0.5, 1e-10
 """Upper and lower bound of eta."""
@@ -155,7 +154,7 @@ def solve_direction(newton, gradient, descent, eta, most):
 
 NEWTON_CG_PROGRESS_DTYPE = np.dtype(
     [
-        ("is_started", np.int64),  # whether the preconditioned gradient is that of the current point
+        ("is_started", np.int64),
         ("eta", np.float64),  # tolerance of the next direction, relative to |g|
         ("residual", np.float64),  # at the current point [J^(1/2)]; negative: not yet known
     ]
@@ -164,26 +163,17 @@ NEWTON_CG_PROGRESS_DTYPE = np.dtype(
 
 
 class NewtonCGArrays(NamedTuple):
-    """Arrays of the iteration for one system, without elements.
+    """Arrays of the iteration for one system.
 
     Attributes:
-        terms: springs, inertia and penalty pins.
-        form: sum of the quadratic forms.
+        search: springs and quadratic forms, line search and residual.
         linear_terms: scratch, the linearised springs (m, 4).
         equation: Newton equation with that linearisation and no scaling, in one thread.
-        unpinned_trace: trace of the unpinned part of Q [N/m].
-        norm: norm of residuals.
-        trial_positions, trial_gradient: scratch, (n, 3) [m] and [N].
     """
 
-    terms: ObjectiveTerms
-    form: QuadraticForm
+    search: SearchArrays
     linear_terms: NDArray[np.float64]
     equation: NewtonEquation
-    unpinned_trace: float
-    norm: ResidualNorm
-    trial_positions: NDArray[np.float64]
-    trial_gradient: NDArray[np.float64]
 
 
 @register_jitable(**jit_inner_options)
@@ -206,21 +196,18 @@ def _take_step(state):
     """Do a step; return whether the positions changed."""
     arrays, step_data, exact_pins, p, gradient, descent, progress = state
     now, newton, product = progress[0], arrays.equation, compute_inner_product(gradient, descent)
-    if not product > (EPS * compute_max_magnitude(p)) ** 2 * arrays.unpinned_trace:
+    if not exceeds_roundoff(arrays.search, p, product):
         return False
-    linearise_springs(arrays.terms, p, arrays.linear_terms)
+    linearise_springs(arrays.search.objective_terms, p, arrays.linear_terms)
     solve_direction(newton, gradient, descent, now.eta, MAX_CG_ITERATIONS)
-    search = arrays.terms, arrays.form, step_data, exact_pins, p
-    q, following, slope = arrays.trial_positions, arrays.trial_gradient, compute_inner_product(gradient, newton.d)
-    if not search_backtracking(*search, newton.d, slope, q, following):
+    slope = compute_inner_product(gradient, newton.d)
+    if not search_backtracking(arrays.search, step_data, exact_pins, p, newton.d, 1.0, slope):
         for v in range(len(p)):
             for c in range(3):
                 newton.d[v, c] = -descent[v, c]
-        if not search_backtracking(*search, newton.d, -product, q, following):
+        if not search_backtracking(arrays.search, step_data, exact_pins, p, newton.d, 1.0, -product):
             return False
-    for v in range(len(p)):
-        for c in range(3):
-            p[v, c], gradient[v, c] = q[v, c], following[v, c]
+    move_to_trial(arrays.search, p, gradient)
     solve_supernodal(newton.factor, gradient, descent, None)
     now.eta = update_eta(now.eta, compute_inner_product(gradient, descent), product, MAX_ETA)
     now.residual = -1.0
@@ -230,12 +217,9 @@ def _take_step(state):
 @jit_inner
 def _compute_residual(state):
     arrays, _, _, _, gradient, descent, progress = state
-    now, correction = progress[0], arrays.norm.correction
+    now = progress[0]
     if now.residual < 0.0:
-        for v in range(len(descent)):
-            for c in range(3):
-                correction[v, c] = descent[v, c]
-        now.residual = compute_correction_norm(arrays.norm.matrix, correction, gradient)
+        now.residual = compute_norm_of_correction(arrays.search.residual_norm, descent, gradient)
     return now.residual
 
 
@@ -253,8 +237,8 @@ def run_newton_cg(arrays, step_data, exact_pins, limits, p, gradient, descent, p
         limits: limits of the loop, in iterations.
         p: positions (n, 3) [m], updated.
         gradient: gradient there (n, 3) [N], updated.
-        descent: preconditioned gradient Q^-1 g (n, 3) [m], updated; zero at exactly pinned vertices.
-        progress: progress of the solve (1,), updated.
+        descent: preconditioned gradient Q^-1 g (n, 3) [m], updated; zero at the start.
+        progress: progress of the solve (1,), updated; zero at the start.
 
     Returns:
         Number of iterations, last residual [J^(1/2)] and termination reason.

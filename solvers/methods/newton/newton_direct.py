@@ -27,6 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 from springbench.solvers.contact.half_space.vertex_contact import is_vertex_contact
 from springbench.solvers.iteration.descent_method import (
+    CompiledDescentState,
     DescentPoint,
     PreparedDescent,
     ResidualMetric,
@@ -34,17 +35,10 @@ from springbench.solvers.iteration.descent_method import (
     inner_product,
 )
 from springbench.solvers.iteration.idle_contact import skip_idle_contact
-from springbench.solvers.iteration.iterative_solver import CompiledState, SolverState
+from springbench.solvers.iteration.iterative_solver import SolverState
 from springbench.solvers.iteration.solver_info import Citation, SolverInfo
 from springbench.solvers.jit.typed_kernel import TypedKernel
-from springbench.solvers.kernels.iteration_loop import (
-    REASON_ITERATIONS,
-    RESIDUAL_EACH,
-    LoopLimits,
-    check_residual,
-)
-from springbench.solvers.kernels.quadratic_form_kernels import QuadraticForm
-from springbench.solvers.kernels.residual_norm import ResidualNorm
+from springbench.solvers.kernels.iteration_loop import REASON_ITERATIONS, RESIDUAL_EACH, LoopLimits, check_residual
 from springbench.solvers.methods.newton import newton_kernel
 from springbench.solvers.methods.newton.hessian_regularisation import (
     REGULARISATION_RULES,
@@ -128,9 +122,13 @@ class PreparedExactNewton(PreparedDescent):
     @cached_property
     def compiled_arrays(self) -> NewtonArrays | None:
         """Arrays of compiled iterations in one thread, or None if they are not supported."""
-        if not self.method.regularises_by_schedule or self.metric.kernel_norm is None:
+        search = self.metric.build_search_arrays(self.fixed_objective) if self.method.regularises_by_schedule else None
+        if search is None:
             return None
-        return build_newton_arrays(self.fixed_objective, self.metric.unpinned_trace, self.metric.kernel_norm)
+        matrix, system = self.fixed_objective.hessian_matrix, self.metric.system
+        blocks = matrix.block_indices, matrix.constant_blocks, np.empty(0), matrix.values
+        scratch = np.empty((len(system.free_vertices), 3)), np.zeros((system.num_vertices, 3))
+        return NewtonArrays(search, *blocks, matrix.factor.kernel_factor, *scratch)
 
     @cached_property
     def run_exact_steps(self) -> TypedKernel:
@@ -149,92 +147,50 @@ class PreparedExactNewton(PreparedDescent):
         return _CompiledNewtonState(self, self.compiled_arrays, *self._build_step(problem, initial_guess))
 
 
-class _CompiledNewtonState(CompiledState):
+class _CompiledNewtonState(CompiledDescentState):
     """The state of a solve with compiled iterations where the exact Hessian has a factor."""
 
     def __init__(
         self, prepared: PreparedExactNewton, arrays: NewtonArrays, step: StepObjective, start: DescentPoint
     ) -> None:
-        self._prepared, self._arrays, self._step = prepared, arrays, step
-        self.positions, self._gradient = start.positions, start.gradient
-        self._progress = np.zeros(1, NEWTON_PROGRESS_DTYPE)
-        self._progress["residual"] = -1.0
+        super().__init__(prepared.run_exact_steps, arrays, step, start, 0, NEWTON_PROGRESS_DTYPE)
+        self._method, self._factor = prepared.method, prepared.fixed_objective.hessian_matrix.factor
 
     def run_iterations(self, limits: LoopLimits) -> tuple[int, float, int]:
         """Iterate up to the limits; return count, residual and reason."""
         count, residual, ended = self._run_exact_steps(limits)
-        while self._progress["failed_supernode"][0] >= 0 and self._take_regularised_step():
+        while self.progress["failed_supernode"][0] >= 0 and self._take_regularised_step():
             count += 1
-            left = limits._replace(max_iterations=limits.max_iterations - count)
             if limits.residual_mode == RESIDUAL_EACH:
                 residual = self.residual()
                 ended = check_residual(residual, limits)
                 if ended != REASON_ITERATIONS:
                     break
-            more, residual, ended = self._run_exact_steps(left)
+            more, residual, ended = self._run_exact_steps(limits._replace(max_iterations=limits.max_iterations - count))
             count += more
         return count, residual, ended
 
     def _run_exact_steps(self, limits: LoopLimits) -> tuple[int, float, int]:
         """Iterate as long as the exact Hessian has a factor; return count, residual and reason."""
-        progress, data = self._progress, (self._step.step_data, self._step.exact_pins)
-        found = self._prepared.run_exact_steps.call(
-            self._arrays, *data, limits, self.positions, self._gradient, progress
-        )
-        self._prepared.fixed_objective.hessian_matrix.factor.count_factorisations(
-            int(progress["num_factorisations"][0]), int(progress["failed_supernode"][0])
-        )
+        found, now = super().run_iterations(limits), self.progress[0]
+        self._factor.count_factorisations(int(now["num_factorisations"]), int(now["failed_supernode"]))
         return found
 
     def _take_regularised_step(self) -> bool:
         """Do a step where the exact Hessian has no factor; return whether the positions changed."""
-        at = DescentPoint(self.positions.copy(), self._gradient.copy())
-        steepest = float(self._progress["steepest_slope"][0])
-        found, steepest = self._prepared.method.next_point(self._step, at, steepest, ShiftScheduleRule(1))
-        self._progress["steepest_slope"] = steepest
+        at, progress = DescentPoint(self.positions.copy(), self.gradient.copy()), self.progress
+        steepest = float(progress["steepest_slope"][0])
+        found, progress["steepest_slope"] = self._method.next_point(self._step, at, steepest, ShiftScheduleRule(1))
         if found.is_stalled:
-            self._progress["is_stalled"] = 1
+            progress["is_stalled"] = 1
             return False
-        self.positions[:], self._gradient[:] = found.positions, found.gradient
-        self._progress["residual"] = -1.0
+        self.positions[:], self.gradient[:] = found.positions, found.gradient
+        progress["residual"] = -1.0
         return True
-
-    def compute_start_residual(self) -> float:
-        """Return the residual at the initial guess [J^(1/2)]."""
-        return self.residual()
 
     def can_terminate(self) -> bool:
         """Return whether the iterate may be a minimum if it is stationary."""
-        return self._prepared.method.can_terminate(self._step, DescentPoint(self.positions, self._gradient))
-
-
-def build_newton_arrays(objective: FixedObjective, unpinned_trace: float, norm: ResidualNorm) -> NewtonArrays | None:
-    """Build the arrays of compiled iterations; return None if they are not supported.
-
-    Energies other than springs and quadratic forms are not supported.
-
-    Args:
-        objective: objective of the system, perhaps without barriers.
-        unpinned_trace: trace of the unpinned part of Q [N/m].
-        norm: norm of residuals.
-    """
-    if objective.element_energy_indices or objective.other_energy_indices:
-        return None
-    matrix, n = objective.hessian_matrix, objective.system.num_vertices
-    vectors = np.zeros((3, n, 3))
-    return NewtonArrays(
-        objective.objective_terms,
-        objective.quadratic_form or QuadraticForm.empty_form(),
-        matrix.block_indices,
-        matrix.constant_blocks,
-        np.empty(0),
-        matrix.values,
-        matrix.factor.kernel_factor,
-        unpinned_trace,
-        norm,
-        np.empty((len(objective.system.free_vertices), 3)),
-        *vectors,
-    )
+        return self._method.can_terminate(self._step, DescentPoint(self.positions, self.gradient))
 
 
 class NewtonIteration:

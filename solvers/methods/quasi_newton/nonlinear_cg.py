@@ -23,6 +23,7 @@ from typing import ClassVar
 import numpy as np
 from springbench.solvers.contact.half_space.vertex_contact import without_vertex_contact
 from springbench.solvers.iteration.descent_method import (
+    CompiledDescentState,
     DescentPoint,
     ResidualMetric,
     backtracking_line_search,
@@ -38,6 +39,7 @@ from springbench.solvers.iteration.preconditioners import (
 from springbench.solvers.iteration.solver_info import Citation, SolverInfo
 from springbench.solvers.jit.typed_kernel import TypedKernel
 from springbench.solvers.methods.quasi_newton import nonlinear_cg_kernel
+from springbench.solvers.methods.quasi_newton.nonlinear_cg_kernel import CONJUGATE_PROGRESS_DTYPE, NonlinearCGArrays
 from springbench.solvers.model.step_problem import Positions, PreparedSolver, StepProblem, System, Unsupported
 from springbench.solvers.objective.fixed_objective import FixedObjective
 from springbench.solvers.objective.step_objective import StepObjective
@@ -113,16 +115,25 @@ class PreparedNonlinearCG(IterativeSolver):
             problem: step whose objective is minimised.
             initial_guess: positions (n, 3) [m], not modified.
         """
-        step = StepObjective(self.fixed_objective, problem)
-        if self._engine is None:
-            return _NonlinearCGState(self.metric, self.linearise_at, step, initial_guess)
-        return _CompiledState(self._engine, step, initial_guess)
+        step, arrays = StepObjective(self.fixed_objective, problem), self.compiled_arrays
+        p = step.apply_exact_pins(initial_guess)
+        start = DescentPoint(p, step.gradient(p))
+        if arrays is None or self.metric.is_threaded:
+            return _NonlinearCGState(self.metric, self.linearise_at, step, start)
+        return CompiledDescentState(self._run_nonlinear_cg, arrays, step, start, 2, CONJUGATE_PROGRESS_DTYPE)
 
     @cached_property
-    def _engine(self) -> _CompiledEngine | None:
-        """The compiled iterations; None for other preconditioners and energies than they support."""
-        is_compiled = self.preconditioner == "cholesky" and self.fixed_objective.is_springs_and_forms
-        return _CompiledEngine(self.metric, self.fixed_objective) if is_compiled else None
+    def compiled_arrays(self) -> NonlinearCGArrays | None:
+        """Arrays of compiled iterations in one thread, or None if they are not supported."""
+        if self.preconditioner != "cholesky" or not (search := self.metric.build_search_arrays(self.fixed_objective)):
+            return None
+        linear = np.empty((len(search.objective_terms.stiffness), 4))
+        scratch = [np.empty_like(search.trial_positions) for _ in range(3)]
+        return NonlinearCGArrays(search, linear, *scratch)
+
+    @cached_property
+    def _run_nonlinear_cg(self) -> TypedKernel:
+        return TypedKernel(nonlinear_cg_kernel.run_nonlinear_cg)
 
     def residual_scale(self, problem: StepProblem) -> float:
         """Return the residual scale [J^(1/2)] for the round-off check."""
@@ -140,78 +151,15 @@ class PreparedNonlinearCG(IterativeSolver):
         }
 
 
-class _CompiledEngine:
-    """Compiled iterations with springs, quadratic forms and the preconditioner Q^-1.
-
-    Attributes:
-        metric: factorised Q.
-        free_memory: work arrays of solves that have ended.
-        start_conjugate_solve, search_along_conjugate: the kernels.
-    """
-
-    def __init__(self, metric: ResidualMetric, objective: FixedObjective) -> None:
-        self.metric, self._objective_terms, self._form = metric, objective.objective_terms, objective.quadratic_form
-        self.free_memory: list[nonlinear_cg_kernel.SearchVectors] = []
-        self.start_conjugate_solve, self.search_along_conjugate = (
-            TypedKernel(nonlinear_cg_kernel.start_conjugate_solve),
-            TypedKernel(nonlinear_cg_kernel.search_along_conjugate),
-        )
-
-    def build_step(self, step: StepObjective, p: Positions) -> nonlinear_cg_kernel.SearchStep:
-        """Build the arguments of the kernels, with work arrays of their own.
-
-        Args:
-            step: the objective.
-            p: positions (n, 3) [m] at the start, which the kernels update.
-        """
-        vectors = (
-            self.free_memory.pop()
-            if self.free_memory
-            else nonlinear_cg_kernel.SearchVectors.from_counts(len(p), len(self._objective_terms.stiffness))
-        )
-        fixed = self._objective_terms, self._form, step.step_data, step.exact_pins, self.metric.unpinned_trace
-        return nonlinear_cg_kernel.SearchStep(*fixed, p, vectors)
-
-
-class _CompiledState(SolverState):
-    """State of a compiled solve, whose work arrays return to the engine."""
-
-    def __init__(self, engine: _CompiledEngine, step: StepObjective, guess: Positions) -> None:
-        self._engine, self.positions = engine, step.apply_exact_pins(guess)
-        self._step = engine.build_step(step, self.positions)
-        self._gradient = self._step.vectors.gradient
-        engine.start_conjugate_solve.call(self._step)
-        self._correction = engine.metric.solve(self._gradient)
-
-    def step_state(self) -> bool:
-        """Do one iteration; return False if round-off prevents any further change."""
-        if not self._engine.search_along_conjugate.call(self._step, self._correction):
-            return False
-        self._correction = self._engine.metric.solve(self._gradient)
-        return True
-
-    def compute_start_residual(self) -> float:
-        """Return the residual at the initial guess [J^(1/2)]."""
-        return self.residual()
-
-    def residual(self) -> float:
-        """Return the residual [J^(1/2)] at the iterate."""
-        return self._engine.metric.correction_norm(self._correction.copy(), self._gradient)
-
-    def __del__(self) -> None:
-        self._engine.free_memory.append(self._step.vectors)
-
-
 class _NonlinearCGState(SolverState):
     """State of an interpreted solve: the current point, and the direction that led to it."""
 
     def __init__(
-        self, metric: ResidualMetric, linearise_at: PreconditionerBuilder, step: StepObjective, guess: Positions
+        self, metric: ResidualMetric, linearise_at: PreconditionerBuilder, step: StepObjective, start: DescentPoint
     ) -> None:
         self._metric, self._linearise_at, self._step = metric, linearise_at, step
-        p = step.apply_exact_pins(guess)
-        self._previous_direction, self._beta = np.zeros_like(p), 0.0
-        self._set_point(DescentPoint(p, step.gradient(p)))
+        self._previous_direction, self._beta = np.zeros_like(start.positions), 0.0
+        self._set_point(start)
 
     def _set_point(self, at: DescentPoint) -> None:
         self._current_point, self.positions = at, at.positions

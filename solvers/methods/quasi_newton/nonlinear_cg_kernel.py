@@ -1,252 +1,149 @@
-"""Iterations of nonlinear conjugate gradients without Python, for springs, quadratic forms and single vertices.
+"""Compiled iterations of nonlinear conjugate gradients, for springs and quadratic forms.
 
-They are those of `springbench.solvers.methods.quasi_newton.nonlinear_cg` with Q^-1 as the preconditioner, in the same
-order of operations. A kernel does one iteration; between two of them Python solves with the factor of Q.
+The preconditioner is a factor of Q. `springbench.solvers.methods.quasi_newton.nonlinear_cg` describes the method.
 """
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from springbench.solvers.iteration.descent_method import MAX_HALVINGS
 from springbench.solvers.jit.kernel_compilation import jit_inner, jit_kernel
-from springbench.solvers.kernels.objective_kernels import (
-    ExactPins,
-    ObjectiveTerms,
-    StepData,
-    compute_max_magnitude,
-    try_step,
-    write_free_gradient,
+from springbench.solvers.kernels.descent_search import (
+    SearchArrays,
+    exceeds_roundoff,
+    move_to_trial,
+    search_backtracking,
 )
-from springbench.solvers.kernels.quadratic_form_kernels import QuadraticForm
+from springbench.solvers.kernels.iteration_loop import build_compiled_loop
+from springbench.solvers.kernels.objective_kernels import compute_inner_product
+from springbench.solvers.kernels.residual_norm import compute_norm_of_correction
 from springbench.solvers.kernels.spring_hessian import linearise_springs, multiply_hessian
-from springbench.solvers.model.rounding_bound import EPS
-from springbench.solvers.model.step_problem import Positions
+from springbench.solvers.linalg.cholesky.triangular_solve import solve_supernodal
 
-FloatArray = NDArray[np.float64]
-
-_SUM_ENTRIES = 8192
-"""Entries of an inner product that are summed together."""
-
-DIRECTION_STATE_DTYPE = np.dtype(
+CONJUGATE_PROGRESS_DTYPE = np.dtype(
     [
-        ("is_new_point", np.int64),  # whether the correction at the current point is still to be read
-        ("slope_change", np.float64),  # d y of the last iteration [J], 0 before the first
+        ("is_started", np.int64),
         ("beta", np.float64),  # multiple of the last direction in the next one
+        ("residual", np.float64),  # at the current point [J^(1/2)]; negative: not yet known
     ]
 )
-"""The scalars of a solve."""
+"""The progress of a solve."""
 
 
-class SearchVectors(NamedTuple):
-    """Vectors of a solve (n, 3), and the entries (3n,) for inner products.
+class NonlinearCGArrays(NamedTuple):
+    """Arrays of the iteration for one system.
 
     Attributes:
-        gradient, gradient_change: g at the current point and y [N].
-        correction, correction_change: z = Q^-1 g and w [m].
-        direction: d [m].
-        product: H d [N].
-        trial_positions, trial_gradient: positions [m] and gradient [N] of a trial.
-        gradient_entries, gradient_change_entries: entries of g and y.
-        correction_entries, correction_change_entries: entries of z and w.
-        direction_entries, product_entries: entries of d and H d.
-        linear_terms: linearised springs (m, 4), as of `linearise_springs`.
-        direction_state: scalars (1,) of type DIRECTION_STATE_DTYPE.
+        search: springs and quadratic forms, line search and residual, with the factor of Q.
+        linear_terms: scratch, the linearised springs (m, 4).
+        hessian_product: scratch, Hessian times direction (n, 3) [N].
+        gradient_change, correction_change: scratch, changes y of the gradient [N] and w of the correction [m], (n, 3).
     """
 
-    gradient: Positions
-    gradient_change: Positions
-    correction: Positions
-    correction_change: Positions
-    direction: Positions
-    product: Positions
-    trial_positions: Positions
-    trial_gradient: Positions
-    gradient_entries: FloatArray
-    gradient_change_entries: FloatArray
-    correction_entries: FloatArray
-    correction_change_entries: FloatArray
-    direction_entries: FloatArray
-    product_entries: FloatArray
-    linear_terms: FloatArray
-    direction_state: NDArray[Any]
+    search: SearchArrays
+    linear_terms: NDArray[np.float64]
+    hessian_product: NDArray[np.float64]
+    gradient_change: NDArray[np.float64]
+    correction_change: NDArray[np.float64]
 
-    @classmethod
-    def from_counts(cls, num_vertices: int, num_springs: int) -> SearchVectors:
-        """Allocate the vectors of a system.
 
-        Args:
-            num_vertices: number of vertices, n.
-            num_springs: number of springs, m.
-        """
-        entries = np.zeros((8, 3 * num_vertices))
-        fields = (x.reshape(-1, 3) for x in entries)
-        return cls(
-            *(*fields, *entries[:6]),
-            linear_terms=np.zeros((num_springs, 4)),
-            direction_state=np.zeros(1, DIRECTION_STATE_DTYPE),
+@jit_inner
+def _take_step(state):
+    """Do a step; return whether the positions changed."""
+    arrays, step_data, exact_pins, p, gradient, correction, direction, progress = state
+    now, slope = progress[0], -compute_inner_product(gradient, correction)
+    if not exceeds_roundoff(arrays.search, p, -slope):
+        return False
+    linearise_springs(arrays.search.objective_terms, p, arrays.linear_terms)
+    found = False
+    if now.beta != 0.0:
+        _combine_directions(now.beta, direction, correction)
+        found = _search_quadratic_model(state, compute_inner_product(gradient, direction))
+    if not found:
+        _combine_directions(0.0, direction, correction)
+        found = _search_quadratic_model(state, slope) or search_backtracking(
+            arrays.search, step_data, exact_pins, p, direction, 1.0, slope
         )
+    if found:
+        _accept_trial(state)
+    return found
 
 
-class SearchStep(NamedTuple):
-    """The objective of a step, the iterate and the vectors of a solve.
+@jit_inner
+def _combine_directions(beta, direction, correction):
+    """Write beta d - z to d."""
+    for v in range(len(direction)):
+        for c in range(3):
+            direction[v, c] = beta * direction[v, c] - correction[v, c]
 
-    Attributes:
-        objective_terms, quadratic_form, step_data, exact_pins: the objective.
-        unpinned_trace: trace of Q's unpinned part [N/m].
-        positions: the iterate (n, 3) [m].
-        vectors: the vectors.
-    """
 
-    objective_terms: ObjectiveTerms
-    quadratic_form: QuadraticForm | None
-    step_data: StepData
-    exact_pins: ExactPins
-    unpinned_trace: float
-    positions: Positions
-    vectors: SearchVectors
+@jit_inner
+def _search_quadratic_model(state, slope):
+    """Search along the direction, first at the quadratic model's minimum; return whether it descends."""
+    arrays, step_data, exact_pins, p, _, _, direction, _ = state
+    terms, form, product = arrays.search.objective_terms, arrays.search.quadratic_form, arrays.hessian_product
+    multiply_hessian(terms, arrays.linear_terms, form, None, None, direction, product)
+    curvature = compute_inner_product(direction, product)  # the direction vanishes at exactly pinned vertices
+    return slope < 0.0 < curvature and search_backtracking(
+        arrays.search, step_data, exact_pins, p, direction, -slope / curvature, slope
+    )
+
+
+@jit_inner
+def _accept_trial(state):
+    """Move to the trial, and compute the correction there and beta."""
+    arrays, _, _, p, gradient, correction, direction, progress = state
+    y, w, now = arrays.gradient_change, arrays.correction_change, progress[0]
+    for v in range(len(p)):
+        for c in range(3):
+            y[v, c], w[v, c] = arrays.search.trial_gradient[v, c] - gradient[v, c], correction[v, c]
+    move_to_trial(arrays.search, p, gradient)
+    solve_supernodal(arrays.search.residual_norm.factor, gradient, correction, None)
+    for v in range(len(p)):
+        for c in range(3):
+            w[v, c] = correction[v, c] - w[v, c]
+    now.beta, now.residual = 0.0, -1.0
+    change = compute_inner_product(direction, y)
+    if change > 0.0:
+        slope = compute_inner_product(gradient, direction)
+        beta = compute_inner_product(y, correction) - compute_inner_product(w, y) * slope / change
+        now.beta = beta / change if np.isfinite(beta) else 0.0
+
+
+@jit_inner
+def _compute_residual(state):
+    arrays, _, _, _, gradient, correction, _, progress = state
+    now = progress[0]
+    if now.residual < 0.0:
+        now.residual = compute_norm_of_correction(arrays.search.residual_norm, correction, gradient)
+    return now.residual
+
+
+_conjugate_loop = build_compiled_loop(_take_step, _compute_residual)
 
 
 @jit_kernel
-def start_conjugate_solve(step: SearchStep):
-    """Start the solve of a step at its positions: write the gradient there.
+def run_nonlinear_cg(arrays, step_data, exact_pins, limits, p, gradient, correction, direction, progress):
+    """Run the iteration loop (`springbench.solvers.kernels.iteration_loop`).
 
     Args:
-        step: the step, with exactly pinned vertices on their targets; its vectors are overwritten.
-    """
-    now = step.vectors.direction_state[0]
-    now.is_new_point, now.slope_change = 1, 0.0
-    terms = step.objective_terms, step.quadratic_form, step.step_data, step.exact_pins
-    write_free_gradient(*terms, step.positions, step.vectors.gradient)
-
-
-@jit_kernel
-def search_along_conjugate(step: SearchStep, correction):
-    """Do one iteration.
-
-    Args:
-        step: the step; its positions and gradient become those of the next point.
-        correction: z = Q^-1 g at the current point (n, 3) [m].
+        arrays: arrays of the system.
+        step_data: data of the step.
+        exact_pins: exactly pinned vertices and their targets.
+        limits: limits of the loop, in iterations.
+        p: positions (n, 3) [m], updated.
+        gradient: gradient g there (n, 3) [N], updated.
+        correction: z = Q^-1 g (n, 3) [m], updated; zero at the start.
+        direction: last direction d (n, 3) [m], updated; zero at the start.
+        progress: progress of the solve (1,), updated; zero at the start.
 
     Returns:
-        Whether a step descended. If not, the positions do not change.
+        Number of iterations, last residual [J^(1/2)] and termination reason.
     """
-    vectors, now = step.vectors, step.vectors.direction_state[0]
-    if now.is_new_point:
-        _read_correction(vectors, now, correction)
-    slope = -_inner_product(vectors.gradient_entries, vectors.correction_entries)
-    roundoff = (EPS * compute_max_magnitude(step.positions)) ** 2 * step.unpinned_trace
-    if not -slope > roundoff:
-        return False
-    linearise_springs(step.objective_terms, step.positions, vectors.linear_terms)
-    if now.beta != 0.0:
-        for k in range(len(vectors.direction_entries)):
-            vectors.direction_entries[k] = now.beta * vectors.direction_entries[k] - vectors.correction_entries[k]
-        along = _inner_product(vectors.gradient_entries, vectors.direction_entries)
-        if _search_quadratic_model(step, along):
-            _accept_trial(step, now)
-            return True
-    for k in range(len(vectors.direction_entries)):
-        vectors.direction_entries[k] = -vectors.correction_entries[k]
-    if _search_quadratic_model(step, slope) or _search_line(step, slope, 1.0):
-        _accept_trial(step, now)
-        return True
-    return False
-
-
-@jit_inner
-def _read_correction(vectors, now, correction):
-    """Copy the correction at a new point, and compute beta."""
-    for v in range(len(correction)):
-        for c in range(3):
-            vectors.correction_change[v, c] = correction[v, c] - vectors.correction[v, c]
-            vectors.correction[v, c] = correction[v, c]
-    now.is_new_point, now.beta = 0, 0.0
-    if not now.slope_change > 0.0:
-        return
-    y, d = vectors.gradient_change_entries, vectors.direction_entries
-    slope = _inner_product(vectors.gradient_entries, d)
-    beta = (
-        _inner_product(y, vectors.correction_entries)
-        - _inner_product(vectors.correction_change_entries, y) * slope / now.slope_change
-    )
-    if np.isfinite(beta):
-        now.beta = beta / now.slope_change
-
-
-@jit_inner
-def _search_quadratic_model(step, slope):
-    """Search along the direction, first at the minimum of the quadratic model."""
-    vectors, terms = step.vectors, step.objective_terms
-    multiply_hessian(terms, vectors.linear_terms, step.quadratic_form, None, None, vectors.direction, vectors.product)
-    for k in range(len(step.exact_pins.vertices)):
-        for c in range(3):
-            vectors.product[step.exact_pins.vertices[k], c] = 0.0
-    curvature = _inner_product(vectors.direction_entries, vectors.product_entries)
-    return slope < 0.0 < curvature and _search_line(step, slope, -slope / curvature)
-
-
-@jit_inner
-def _search_line(step, slope, initial_step):
-    """Search along the direction by halving the step size; return whether it descends."""
-    vectors, t = step.vectors, initial_step
-    for _ in range(MAX_HALVINGS if slope < 0.0 < t else 0):
-        _, is_sufficient = try_step(
-            step.objective_terms,
-            step.quadratic_form,
-            step.step_data,
-            step.exact_pins,
-            step.positions,
-            vectors.direction,
-            t,
-            slope,
-            0.0,
-            vectors.trial_positions,
-            vectors.trial_gradient,
-        )
-        if is_sufficient:
-            return True
-        t *= 0.5
-    return False
-
-
-@jit_inner
-def _accept_trial(step, now):
-    """Make the trial the current point."""
-    vectors = step.vectors
-    for v in range(len(step.positions)):
-        for c in range(3):
-            step.positions[v, c] = vectors.trial_positions[v, c]
-            vectors.gradient_change[v, c] = vectors.trial_gradient[v, c] - vectors.gradient[v, c]
-            vectors.gradient[v, c] = vectors.trial_gradient[v, c]
-    now.is_new_point = 1
-    now.slope_change = _inner_product(vectors.direction_entries, vectors.gradient_change_entries)
-
-
-@jit_inner
-def _inner_product(a, b):
-    """Return the inner product of two vectors, summed as by `numpy.einsum` on x86-64.
-
-    Even and odd entries are summed separately, in groups of eight from the last pair to the first.
-
-    Args:
-        a, b: entries (k,).
-    """
-    total = 0.0
-    for begin in range(0, len(a), _SUM_ENTRIES):
-        end = min(len(a), begin + _SUM_ENTRIES)
-        even, odd, k = 0.0, 0.0, begin
-        while k + 8 <= end:
-            for pair in range(6, -1, -2):
-                even += a[k + pair] * b[k + pair]
-                odd += a[k + pair + 1] * b[k + pair + 1]
-            k += 8
-        while k < end:
-            even += a[k] * b[k]
-            if k + 1 < end:
-                odd += a[k + 1] * b[k + 1]
-            k += 2
-        total += even + odd
-    return total
+    now = progress[0]
+    if now.is_started == 0:
+        solve_supernodal(arrays.search.residual_norm.factor, gradient, correction, None)
+        now.is_started, now.residual = 1, -1.0
+    return _conjugate_loop((arrays, step_data, exact_pins, p, gradient, correction, direction, progress), limits)
