@@ -35,7 +35,7 @@ class SearchArrays(NamedTuple):
 
 @jit_inner
 def exceeds_roundoff(arrays, p, decrement):
-    """Return whether g' H^-1 g exceeds the bound for a gradient g that is round-off of the positions.
+    """Return whether g' H^-1 g exceeds its bound for a gradient g that is round-off.
 
     Args:
         arrays: arrays of the system.

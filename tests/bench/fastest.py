@@ -202,6 +202,7 @@ def measure_interleaved(
     for round_number in range(-1, rounds):  # the first round is a warm-up
         for one in candidates if round_number % 2 else candidates[::-1]:
             numbers = sorted(set(one.num_iterations.values()))
+            measure_iterate_seconds(one.prepared, problem, numbers)  # fills the caches, as the previous step does
             by_number = dict(zip(numbers, measure_iterate_seconds(one.prepared, problem, numbers), strict=True))
             for target, number in one.num_iterations.items() if round_number >= 0 else ():
                 times[one.name][target].append(by_number[number])
