@@ -17,7 +17,8 @@ is no certified minimum reaches no accuracy.
 
 A method reaches an accuracy with its first iterate that satisfies it. A first pass evaluates all iterates. The methods
 that may be the fastest are then timed interleaved in one process, for several rounds, by the processor time of the
-thread and without evaluation. The interval is a bootstrap interval: it contains 95 % of the ratios of resampled rounds.
+thread and without evaluation. A timed solve follows an untimed one of the same method: the caches then hold its data,
+as after the previous step of a simulation. The interval is a bootstrap interval: it contains 95 % of the ratios of resampled rounds.
 The mark > denotes a ratio whose interval exceeds the first of LIMITS in a step that takes at least MIN_COUNTED_SECONDS;
 `inf` denotes an accuracy that the method does not reach. `configs/fastest.yaml` has other steps than
 `configs/accuracy.yaml`. The steps of `configs/unseen.yaml` were not used to choose any part of a solver.
@@ -202,7 +203,7 @@ def measure_interleaved(
     for round_number in range(-1, rounds):  # the first round is a warm-up
         for one in candidates if round_number % 2 else candidates[::-1]:
             numbers = sorted(set(one.num_iterations.values()))
-            measure_iterate_seconds(one.prepared, problem, numbers)  # fills the caches, as the previous step does
+            measure_iterate_seconds(one.prepared, problem, numbers)  # fills the caches
             by_number = dict(zip(numbers, measure_iterate_seconds(one.prepared, problem, numbers), strict=True))
             for target, number in one.num_iterations.items() if round_number >= 0 else ():
                 times[one.name][target].append(by_number[number])
