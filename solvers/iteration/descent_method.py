@@ -272,7 +272,7 @@ class ResidualMetric:
             self.factor.solve(np.ascontiguousarray(b), out)
             return out
         out, x = np.zeros_like(b), np.empty((len(free), 3))
-        self.factor.solve(np.ascontiguousarray(b[free]), x)
+        self.factor.solve(b.take(free, axis=0), x)
         out[free] = x
         return out
 

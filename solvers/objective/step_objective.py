@@ -467,7 +467,7 @@ class Hessian:
         return self._extend_to_all(self._factor.solve(self._select_free(b)), b)
 
     def _select_free(self, b: Positions) -> Positions:
-        return b[self.free_vertices] if len(self.free_vertices) < len(b) else b
+        return b.take(self.free_vertices, axis=0) if len(self.free_vertices) < len(b) else b
 
     def _extend_to_all(self, x: Positions, b: Positions) -> Positions:
         """Return x (f, 3) with rows of zeros at vertices that are not free.

@@ -205,7 +205,7 @@ def test_predicted_tensions_follow_the_second_hessian_without_a_factor(lbfgs_gai
     choice = MethodChoice(method, step, given.initial_guess, run, SolveControl(), method.init_rounds())
     choice._gains |= {"lbfgs": lbfgs_gain, "newton": 1.0}
     for attempt in range(1, num_attempts + 1):
-        assert choice._take_newton_step().positions is given.initial_guess
+        assert choice._take_newton_step()[0].positions is given.initial_guess
         assert choice._gains["predicted tensions"] == (np.inf if attempt == num_attempts else 0.0)
 
 

@@ -480,6 +480,7 @@ class MeasuredRule(ShiftScheduleRule):
         agrees_with_model: whether the Hessian of the last step was unmodified and its decrease agreed with the model.
         decrement_ratio: ratio of the squared Newton decrements g'H^-1 g after and before a step that agreed.
         is_exact_only: whether only the unmodified Hessian may be factorised.
+        decrease: decrease of the objective in the last step [J]; None before it, and if there was none.
     """
 
     def __init__(self, inertia_diagonal: NDArray[np.float64], factor: BlockCholesky) -> None:
@@ -494,7 +495,7 @@ class MeasuredRule(ShiftScheduleRule):
         self._gains = {"shift": np.inf, "schedule": np.inf}  # [J] per factorisation, when last used
         self._name = "shift"
         self.agrees_with_model = self.is_exact_only = False
-        self.decrement_ratio = 0.0
+        self.decrement_ratio, self.decrease = 0.0, cast(float | None, None)
 
     def factorise_hessian(self, hessian: Hessian, at: DescentPoint, diagonal: NDArray[np.float64]) -> int | None:
         """Factorise the exact Hessian or, unless `is_exact_only`, a shifted one.
@@ -507,7 +508,7 @@ class MeasuredRule(ShiftScheduleRule):
         Returns:
             0 if nothing was added, more for other factors, None for no factor.
         """
-        self.agrees_with_model, self._before = False, self._factor.num_factorisations
+        self.agrees_with_model, self.decrease, self._before = False, None, self._factor.num_factorisations
         self._name = max(self._gains, key=lambda name: self._gains[name])
         if self.is_exact_only:
             self._level = 0 if hessian.factorise() else None
@@ -537,7 +538,8 @@ class MeasuredRule(ShiftScheduleRule):
             to: point at which the line search ended.
         """
         slope = inner_product(at.gradient, at.positions - to.positions)
-        fall, (low, high) = compute_objective_decrease(step, at, to), _MODEL_RANGE
+        self.decrease = fall = compute_objective_decrease(step, at, to)
+        low, high = _MODEL_RANGE
         if self._name == "shift":
             self._shift.can_reduce = fall >= MODEL_DECREASE_FRACTION * slope or self._shift.value == np.inf
         if self._level:
@@ -789,8 +791,8 @@ class MethodChoice:
                         positions = self._point.positions
                         self._point, self._run = DescentPoint(positions, self._step.gradient(positions)), None
                     before = self._method.factor.num_factorisations
-                    point = self._take_newton_step() if name == "newton" else self._take_predicted_step()
-                    self._record_step(name, point, self._method.factor.num_factorisations - before)
+                    point, fall = self._take_newton_step() if name == "newton" else self._take_predicted_step()
+                    self._record_step(name, point, fall, self._method.factor.num_factorisations - before)
             if point is not self._point:
                 self._point, self._control.is_minimum = point, self._agrees_with_model
                 yield point
@@ -870,8 +872,8 @@ class MethodChoice:
         elif ended == REASON_STALLED or residual <= self._floor:
             self._gains["lbfgs"], self._is_trial_due = 0.0, True
 
-    def _take_newton_step(self) -> DescentPoint:
-        """Return the point after a step of the exact method.
+    def _take_newton_step(self) -> tuple[DescentPoint, float]:
+        """Return the point after an exact step, and the decrease of the objective [J].
 
         If the exact Hessian has no factor, the current point is returned. Predicted tensions follow from the second
         time on, or if L-BFGS has ended. The first time, L-BFGS has often not yet reached a convex region, and the next
@@ -884,31 +886,31 @@ class MethodChoice:
                 self._gains["predicted tensions"] = np.inf
             else:
                 self._was_indefinite, self._patience = True, 0.5 * self._patience
-            return self._point
-        return point
+            return self._point, 0.0
+        fall = self._rule.decrease
+        return point, compute_objective_decrease(self._step, self._point, point) if fall is None else fall
 
-    def _take_predicted_step(self) -> DescentPoint:
-        """Return the point after a step with predicted tensions."""
+    def _take_predicted_step(self) -> tuple[DescentPoint, float]:
+        """Return the point after a step with predicted tensions, and the decrease of the objective [J]."""
         step, point = self._step, self._point
         if self._predicting is None:
             self._predicting = PredictedTensionNewton(self._method, step, self._origin())
-            following, _, is_past_saddle = self._predicting.compute_first_step(point)
+            following, fall, is_past_saddle = self._predicting.compute_first_step(point)
             if is_past_saddle:
                 self._gains["lbfgs"] = np.inf
-            return following
-        following, _, self._is_trial_due = self._predicting.compute_next_step(point)
-        return following
+            return following, fall
+        following, fall, self._is_trial_due = self._predicting.compute_next_step(point)
+        return following, fall
 
     def _origin(self) -> DescentPoint:
         """Return the point at which the solve started."""
         return DescentPoint(self._start, self._step.gradient(self._start))
 
-    def _record_step(self, name: str, to: DescentPoint, num_factorisations: float) -> None:
+    def _record_step(self, name: str, to: DescentPoint, fall: float, num_factorisations: float) -> None:
         """Record the decrease per cost of a Newton step.
 
         This also determines when the exact method is tried next.
         """
-        fall = compute_objective_decrease(self._step, self._point, to)
         cost = self._method.newton_cost * num_factorisations
         self._control.add_phase(name, int(to.positions is not self._point.positions), num_factorisations)
         if fall == 0.0:

@@ -84,16 +84,18 @@ class PredictedTensionNewton:
             return at, 0.0, False
         self._slope = -inner_product(at.gradient, descent)
         following = backtracking_line_search(step, at, -descent, uses_rounded_slope=True) or at
-        is_accurate = compute_objective_decrease(step, at, following) > -MODEL_DECREASE_FRACTION * self._slope
+        fall = compute_objective_decrease(step, at, following)
+        is_accurate = fall > -MODEL_DECREASE_FRACTION * self._slope
         self._shift.can_reduce = is_accurate
         curvature = probe_negative_curvature(step, following, hessian, self._method.system_diagonal)
-        following = curvature or following
+        if curvature is not None:
+            following, fall = curvature, compute_objective_decrease(step, at, curvature)
         if is_accurate:
             self._first_point, self._predicted_tensions = (
                 None,
                 step.linearise_tensions(following.positions, np.zeros_like(descent)),
             )
-        return following, compute_objective_decrease(step, at, following), curvature is not None
+        return following, fall, curvature is not None
 
     def compute_next_step(self, point: DescentPoint) -> tuple[DescentPoint, float, bool]:
         """Do a step with predicted tensions.
