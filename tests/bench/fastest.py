@@ -167,19 +167,46 @@ def build_candidate(
         return None
     own_minimum = find_own_minimum(prepared, problem) if compute_measure is None else np.nan
     compute_measure = compute_measure or build_gap(problem, own_minimum)
-    num_iterations, seconds = dict[float, int](), dict[float, float]()
-    iterates, spent = prepared.iterates(problem), 0.0
-    for number in range(1, spec.max_iterations + 1):
+    limits = spec.max_iterations, spec.measurement.time_limit
+    found, is_in_time = find_first_iterates(prepared, problem, compute_measure, targets, *limits)
+    if not is_in_time:  # perhaps because kernels were compiled
+        found, _ = find_first_iterates(prepared, problem, compute_measure, targets, *limits)
+    numbers, seconds = ({target: pair[k] for target, pair in found.items()} for k in range(2))
+    return CandidateSolve(spec.solver.name, prepared, numbers, seconds, own_minimum)
+
+
+def find_first_iterates(
+    prepared: PreparedSolver,
+    problem: StepProblem,
+    compute_measure: Callable[[Positions], float],
+    targets: Sequence[float],
+    max_iterations: int,
+    time_limit: float,
+) -> tuple[dict[float, tuple[int, float]], bool]:
+    """Find the first iterates that satisfy the accuracies.
+
+    Args:
+        prepared: the method.
+        problem: the step.
+        compute_measure: measure of an iterate.
+        targets: accuracies.
+        max_iterations: maximum number of iterations.
+        time_limit: limit of the processor time [s].
+
+    Returns:
+        Number of the iterate and processor time [s] by accuracy, and whether the time limit was not exceeded.
+    """
+    found, spent = dict[float, tuple[int, float]](), 0.0
+    iterates = prepared.iterates(problem)
+    for number in range(1, max_iterations + 1):
         began = thread_time()
         p = next(iterates)
         spent += thread_time() - began
         remaining = compute_measure(p)
-        for target in targets:
-            if remaining <= target and target not in num_iterations:
-                num_iterations[target], seconds[target] = number, spent
-        if len(num_iterations) == len(targets) or spent > spec.measurement.time_limit or not np.isfinite(remaining):
+        found |= {target: (number, spent) for target in targets if remaining <= target and target not in found}
+        if len(found) == len(targets) or spent > time_limit or not np.isfinite(remaining):
             break
-    return CandidateSolve(spec.solver.name, prepared, num_iterations, seconds, own_minimum)
+    return found, spent <= time_limit
 
 
 def measure_iterate_seconds(prepared: PreparedSolver, problem: StepProblem, numbers: Sequence[int]) -> list[float]:

@@ -29,13 +29,14 @@ from springbench.harness.report.pages.page_files import check_pages, write_pages
 from springbench.harness.report.pages.page_templates import digest_panels
 from springbench.harness.report.pages.published_queries import PublishedQueries
 from springbench.harness.report.plot_style import SeriesStyle
+from springbench.harness.results.parquet_rows import write_rows
 from springbench.harness.results.published_set import read_study
 from typer.testing import CliRunner
 
 from tests.bench.scripted_study import add_provenance, describe_provenance, publish_rows
 from tests.contracts.hostile import scene
 from tests.synthetic_accuracy_rows import build_work_rows, write_accuracy_rows
-from tests.synthetic_run_rows import write_dummy_runs
+from tests.synthetic_run_rows import build_dummy_rows, write_dummy_runs
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 
@@ -95,6 +96,34 @@ def test_a_study_gains_the_runs_of_its_parts(checkout: Path) -> None:
         assert result.exit_code == 0, result.output
         assert read_study(study).metadata["runs"] == 13
         assert read_study(study).read_table("rows").num_rows == 26
+
+
+def test_a_study_of_outcomes_has_no_times(checkout: Path) -> None:
+    study = checkout / "results" / "published" / "dummy"
+    arguments = ["publish-study", str(checkout / "runs"), "--config", str(checkout / "configs/dummy.yaml")]
+    columns = list[set[str]]()
+    for options in ([], ["--omit-times"]):
+        result = CliRunner().invoke(app, [*arguments, *options, "--published", str(study.parent)])
+        assert result.exit_code == 0, result.output
+        columns.append(set(read_study(study).read_table("rows").column_names))
+    assert not read_study(study).is_timed
+    assert "seconds" in columns[0] - columns[1]
+    assert "num_iterations" in columns[1]
+
+
+def test_a_part_without_the_software_of_a_solver_keeps_the_runs_of_another_part(checkout: Path) -> None:
+    newer = checkout / "newer" / "rows"
+    newer.mkdir(parents=True)
+    for number in range(5):
+        rows = [row | {"started_at": "2026-01-02T00:00:00+00:00"} for row in build_dummy_rows(number)]
+        rows = [row | {"status": "unsupported"} if row["solver"] == "numba" else row for row in rows]
+        write_rows(newer / f"{number}.parquet", rows)
+    parts = [checkout / "results" / "published" / "dummy", newer.parent]
+    study = study_publication.write_study(
+        parts, checkout / "configs" / "dummy.yaml", checkout / "results" / "published", lambda line: None
+    )
+    found = {row["run_id"]: row["started_at"][:10] for row in study.read_table("rows").to_pylist()}
+    assert found == {f"{n:012x}": "2026-01-02" if n < 5 and n != 1 else "2026-01-01" for n in range(10)}
 
 
 def test_units_of_a_newer_part_replace_those_of_the_same_file(tmp_path: Path) -> None:

@@ -36,6 +36,9 @@ def publish_study(
     provenance: Annotated[
         Path | None, typer.Option(help="For measurements: rows (.parquet) of a run by the same machine and code.")
     ] = None,
+    omit_times: Annotated[
+        bool, typer.Option("--omit-times", help="Leave out all times: a study of outcomes.", show_default=False)
+    ] = False,
     published: PublishedOption = published_set.PUBLISHED_FOLDER,
 ) -> None:
     """Write the results of a study to the published set of this checkout.
@@ -51,7 +54,7 @@ def publish_study(
     for path in (*results, provenance):
         if path and not path.exists():
             raise InputError(InputMistake("does not exist; expected results, or a Parquet file of measurements", path))
-    write_study(results, owner, published, print_message, provenance)
+    write_study(results, owner, published, print_message, provenance, omits_times=omit_times)
 
 
 def compare(

@@ -2,7 +2,8 @@
 # pyarrow's stubs are incomplete for columns.
 """Write the results of a study to the published set (`springbench.harness.results.published_set`).
 
-Columns that no page uses and no repetition confirms are left out, and so are all times of studies that time nothing.
+Columns that no page uses and no repetition confirms are left out. A study of outcomes has no times, and no rows that
+have only times.
 """
 
 from __future__ import annotations
@@ -41,6 +42,9 @@ DROPPED_COLUMNS = frozenset(
 _TIME_COLUMNS = frozenset(("seconds", "cpu_seconds", "preempted", "load_average", "cold_seconds", "search_seconds"))
 """Columns without meaning where the steps were not timed, and several runs shared the machine."""
 
+_SOLVE_PHASES = ("prepare", "run", "step")
+"""Phases whose rows have more than times; those of the parts of an iteration have nothing else."""
+
 MAX_PAUSE = 600.0
 """Longest time between the starts of two runs that counts as work [s]; one run of a study takes less."""
 
@@ -54,6 +58,8 @@ def write_study(
     published: Path,
     print_message: Callable[[str], None],
     provenance: Path | None = None,
+    *,
+    omits_times: bool = False,
 ) -> published_set.PublishedStudy:
     """Write the study of folders of results to the published set, and return it.
 
@@ -64,6 +70,7 @@ def write_study(
         published: folder of the published set.
         print_message: prints a remark.
         provenance: Parquet file of rows of a run by the same machine and code, for measurements without such columns.
+        omits_times: whether all times are left out, as those of runs that share a machine are.
 
     Raises:
         InputError: there are no rows, runs of several configs, or the published set would become too large.
@@ -73,32 +80,33 @@ def write_study(
     by_part = [_read_part(part) for part in parts]
     made = _read_measurements(provenance) if provenance else None
     found = {
-        table: _drop_missing_software(_join_newest_runs(several))
+        table: _join_newest_runs(several)
         for table in ("measurements", *row_store.TABLE_FOLDERS)
-        if (several := [tables[table] for tables in by_part if table in tables])
+        if (several := [_drop_missing_software(tables[table]) for tables in by_part if table in tables])
     }
     if not found:
         raise InputError(
             InputMistake("contains no rows; expected the folder of one sweep, such as results/hard", parts[0])
         )
-    is_timed = any(_is_timed(rows) for rows in found.values())
+    is_timed = not omits_times and any(_is_timed(rows) for rows in found.values())
     folder = published / config.stem
     published.mkdir(parents=True, exist_ok=True)
     with TemporaryDirectory(dir=published, prefix=".") as temporary:
         for table, rows in found.items():
-            left_out = DROPPED_COLUMNS | (frozenset[str]() if is_timed or _ran_alone(rows) else _TIME_COLUMNS)
-            write_published_table(Path(temporary) / published_set.TABLE_FILES[table], _drop_columns(rows, left_out))
+            has_times = is_timed or (not omits_times and _ran_alone(rows))
+            written = _drop_columns(rows, DROPPED_COLUMNS) if has_times else _drop_times(rows)
+            write_published_table(Path(temporary) / published_set.TABLE_FILES[table], written)
         older = list(folder.glob("*.parquet"))
         size = sum(path.stat().st_size for path in published.rglob("*.parquet") if path not in older)
         if size > MAX_PUBLISHED_BYTES:
             why = f"takes {size:,} bytes with this study, and at most {MAX_PUBLISHED_BYTES:,} are part of a clone"
-            raise InputError(InputMistake(f"{why}; publish fewer runs", published))
+            raise InputError(InputMistake(f"{why}; publish fewer runs, or --omit-times", published))
         folder.mkdir(exist_ok=True)
-        written = sorted(Path(temporary).iterdir())
-        for path in written:
+        replaced = sorted(Path(temporary).iterdir())
+        for path in replaced:
             path.replace(folder / path.name)
         for path in older:  # last: an interruption leaves a table of each kind
-            if path.name not in {one.name for one in written}:
+            if path.name not in {one.name for one in replaced}:
                 path.unlink()
     metadata = {
         "config": os.path.relpath(config.resolve(), folder.resolve()),
@@ -235,7 +243,10 @@ def _read_measurements(path: Path) -> pa.Table:
 
 
 def _drop_missing_software(rows: pa.Table) -> pa.Table:
-    """Drop the rows of solvers that support no run, because their software is not installed."""
+    """Drop the rows of solvers that support no run, because their software is not installed.
+
+    Another part of the study may have them.
+    """
     if "status" not in rows.column_names or "solver" not in rows.column_names:
         return rows
     supported = pc.unique(rows.filter(pc.field("status") != "unsupported")["solver"])
@@ -250,12 +261,15 @@ def _ran_alone(rows: pa.Table) -> bool:
     return "num_concurrent_runs" in rows.column_names and set(rows["num_concurrent_runs"].to_pylist()) <= {1, None}
 
 
-def _drop_columns(rows: pa.Table, names: frozenset[str]) -> pa.Table:
-    """Return the table without empty columns and those of these names.
+def _drop_times(rows: pa.Table) -> pa.Table:
+    """Return the table without times, empty columns, and rows of phases that have only times."""
+    if "phase" in rows.column_names:
+        rows = rows.filter(pc.is_in(rows["phase"], value_set=pa.array(_SOLVE_PHASES)))
+    return _drop_columns(_omit_phase_times(rows), DROPPED_COLUMNS | _TIME_COLUMNS)
 
-    Without `seconds`, `solver_phases` has no times.
-    """
-    rows = _omit_phase_times(rows) if "seconds" in names else rows
+
+def _drop_columns(rows: pa.Table, names: frozenset[str]) -> pa.Table:
+    """Return the table without empty columns and those of these names."""
     selected = [name for name in rows.column_names if name not in names and rows[name].null_count < len(rows)]
     return rows.select(selected)
 
