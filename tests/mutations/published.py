@@ -63,8 +63,8 @@ _TABLE = (
     (
         "published-times-of-untimed",
         "harness/experiments/archive/study_publication.py",
-        "(frozenset[str]() if is_timed or _ran_alone(rows) else _TIME_COLUMNS)",
-        "frozenset[str]()",
+        "_drop_columns(rows, DROPPED_COLUMNS) if has_times else _drop_times(rows)",
+        "_drop_columns(rows, DROPPED_COLUMNS)",
         f"{_TESTS}::test_an_untimed_study_publishes_no_times",
     ),
 )

@@ -111,7 +111,7 @@ def test_a_study_of_outcomes_has_no_times(checkout: Path) -> None:
     assert "num_iterations" in columns[1]
 
 
-def test_a_part_without_the_software_of_a_solver_keeps_the_runs_of_another_part(checkout: Path) -> None:
+def test_a_newer_part_without_software_replaces_no_runs(checkout: Path) -> None:
     newer = checkout / "newer" / "rows"
     newer.mkdir(parents=True)
     for number in range(5):
