@@ -14,7 +14,7 @@ from springbench.solvers.methods.local_global.prefactored import prepare_local_g
 from springbench.solvers.methods.newton.newton_cg import NewtonCG
 from springbench.solvers.methods.newton.newton_direct import NewtonSolver
 from springbench.solvers.methods.quasi_newton.nonlinear_cg import NonlinearCG
-from springbench.solvers.model.step_problem import StopRule
+from springbench.solvers.model.step_problem import StopRule, Unsupported
 
 from tests.effect_scenes import EFFECT_SCENES, build_moving_problem
 from tests.effect_scenes import build_effect_cloth as cloth_with
@@ -75,6 +75,18 @@ def test_more_sweeps_take_fewer_iterations():
         for l in (1, 2, 4)
     )
     assert one > two > four
+
+
+@pytest.mark.parametrize(("scene", "name"), [("contact", "HalfSpaceContact"), ("gas", "Gas")], ids=lambda x: x)
+def test_what_has_no_rows_in_q_is_refused_by_name(scene, name):
+    with pytest.raises(Unsupported, match=f"a-jacobi: .*{name}"):
+        AggregatedJacobi().prepare(build_moving_problem(EFFECT_SCENES[scene]()).system)
+
+
+@pytest.mark.parametrize("sweeps", [0, -1, 9])
+def test_sweeps_are_from_one_to_eight(sweeps):
+    with pytest.raises(ValueError, match="jacobi_sweeps: should be from 1 to 8"):
+        AggregatedJacobi(sweeps)
 
 
 @pytest.mark.parametrize(
