@@ -26,7 +26,7 @@ from springbench.solvers.iteration.iterative_solver import (
 )
 from springbench.solvers.jit.typed_kernel import TypedKernel, as_kernel_array
 from springbench.solvers.kernels import objective_kernels
-from springbench.solvers.kernels.descent_search import SearchArrays
+from springbench.solvers.kernels.descent_search import SearchArrays, bound_decrement_roundoff
 from springbench.solvers.kernels.iteration_loop import LoopLimits
 from springbench.solvers.kernels.line_search_conditions import (
     ARMIJO_FRACTION,
@@ -245,7 +245,7 @@ class ResidualMetric:
 
     def bound_energy_roundoff(self, max_magnitude: float) -> float:
         """Return the bound of `energy_roundoff` for positions with this largest absolute coordinate [m]."""
-        return (EPS * max_magnitude) ** 2 * self.unpinned_trace
+        return bound_decrement_roundoff(max_magnitude, self.unpinned_trace)
 
     def significant_vertices(self, p: Positions, decrease: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Return which vertices are of connected components whose decrease exceeds round-off.
@@ -404,31 +404,43 @@ class _DescentState(SolverState):
         return self._method.can_terminate(self._step, self._point)
 
 
+class CompiledMethod(NamedTuple):
+    """A compiled method for one system of springs and quadratic forms, in one thread.
+
+    Attributes:
+        kernel: kernel of the iteration loop.
+        arrays: its arrays of the system.
+        num_vectors: number of vectors (n, 3) that it carries from iteration to iteration.
+        progress_dtype: type of the progress of a solve.
+    """
+
+    kernel: TypedKernel
+    arrays: Any
+    num_vectors: int
+    progress_dtype: np.dtype
+
+
 class CompiledDescentState(CompiledState):
-    """The state of a solve by a compiled method of springs and quadratic forms.
+    """The state of a solve by a compiled method.
 
     Attributes:
         gradient: gradient at the positions (n, 3) [N].
-        progress: progress of the solve, of a type of the method (1,).
+        progress: progress of the solve (1,).
     """
 
-    def __init__(
-        self, run: TypedKernel, arrays: Any, step: StepObjective, start: DescentPoint, num_vectors: int, dtype: np.dtype
-    ) -> None:
+    def __init__(self, method: CompiledMethod, step: StepObjective, start: DescentPoint) -> None:
         """Prepare a solve, which the first call of the kernel starts.
 
         Args:
-            run: kernel of the iteration loop.
-            arrays: its arrays of the system.
+            method: the method.
             step: the objective.
             start: first point, whose arrays are overwritten.
-            num_vectors: number of vectors (n, 3) that the kernel carries from iteration to iteration.
-            dtype: type of the progress.
         """
-        self._step, self._kernel = step, run
-        self.positions, self.gradient, self.progress = start.positions, start.gradient, np.zeros(1, dtype)
-        self._fixed_arguments = arrays, step.step_data, step.exact_pins
-        self._vectors = np.zeros((num_vectors, *self.positions.shape))
+        self._step, self._kernel = step, method.kernel
+        self.positions, self.gradient = start.positions, start.gradient
+        self.progress = np.zeros(1, method.progress_dtype)
+        self._fixed_arguments = method.arrays, step.step_data, step.exact_pins
+        self._vectors = np.zeros((method.num_vectors, *self.positions.shape))
 
     def run_iterations(self, limits: LoopLimits) -> tuple[int, float, int]:
         """Iterate up to the limits; return count, residual and reason."""

@@ -5,12 +5,13 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numba.extending import register_jitable
 from numpy.typing import NDArray
-from springbench.solvers.jit.kernel_compilation import jit_inner
+from springbench.solvers.jit.kernel_compilation import jit_inner, jit_inner_options
 from springbench.solvers.kernels.line_search_conditions import MAX_HALVINGS
 from springbench.solvers.kernels.objective_kernels import ObjectiveTerms, compute_max_magnitude, try_step
 from springbench.solvers.kernels.quadratic_form_kernels import QuadraticForm
-from springbench.solvers.kernels.residual_norm import ResidualNorm
+from springbench.solvers.kernels.residual_norm import ResidualNorm, compute_norm_of_correction
 from springbench.solvers.model.rounding_bound import EPS
 
 
@@ -33,6 +34,17 @@ class SearchArrays(NamedTuple):
     trial_gradient: NDArray[np.float64]
 
 
+@register_jitable(**jit_inner_options)
+def bound_decrement_roundoff(max_magnitude: float, unpinned_trace: float) -> float:
+    """Return a bound of g' H^-1 g [J] for a gradient g that is round-off.
+
+    Args:
+        max_magnitude: largest absolute coordinate of the positions [m].
+        unpinned_trace: trace of the unpinned part of Q [N/m].
+    """
+    return (EPS * max_magnitude) ** 2 * unpinned_trace
+
+
 @jit_inner
 def exceeds_roundoff(arrays, p, decrement):
     """Return whether g' H^-1 g exceeds its bound for a gradient g that is round-off.
@@ -42,7 +54,7 @@ def exceeds_roundoff(arrays, p, decrement):
         p: positions (n, 3) [m].
         decrement: g' H^-1 g, or another norm of the gradient [J].
     """
-    return decrement > (EPS * compute_max_magnitude(p)) ** 2 * arrays.unpinned_trace
+    return decrement > bound_decrement_roundoff(compute_max_magnitude(p), arrays.unpinned_trace)
 
 
 @jit_inner
@@ -82,3 +94,19 @@ def move_to_trial(arrays, p, gradient):
     for v in range(len(p)):
         for c in range(3):
             p[v, c], gradient[v, c] = arrays.trial_positions[v, c], arrays.trial_gradient[v, c]
+
+
+@jit_inner
+def read_residual(arrays, correction, gradient, progress):
+    """Return the residual [J^(1/2)] at the current point, which is computed once.
+
+    Args:
+        arrays: arrays of the system.
+        correction: Q^-1 g (n, 3) [m].
+        gradient: gradient g (n, 3) [N].
+        progress: progress of the solve (1,), with the fields `residual` and `has_residual`.
+    """
+    now = progress[0]
+    if now.has_residual == 0:
+        now.residual, now.has_residual = compute_norm_of_correction(arrays.residual_norm, correction, gradient), 1
+    return now.residual

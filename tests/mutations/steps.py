@@ -127,14 +127,14 @@ _TABLE = (
         "solvers/methods/quasi_newton/nonlinear_cg_kernel.py",
         "w[v, c] = correction[v, c] - w[v, c]",
         "w[v, c] = correction[v, c]",
-        f"{_U}/test_a_jacobi.py",
+        f"{_U}/test_compiled_iterations.py",
     ),
     (
         "compiled-jacobi-pins",
         "solvers/methods/local_global/aggregated_jacobi_kernel.py",
         "move_to_targets(step.exact_pins, step.vectors.trial_positions)",
         "pass",
-        f"{_U}/test_a_jacobi.py",
+        f"{_U}/test_compiled_iterations.py",
     ),
     (
         "xpbd-force",

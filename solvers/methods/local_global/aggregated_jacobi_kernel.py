@@ -1,4 +1,4 @@
-"""Iterations of A-Jacobi without Python, for springs, quadratic forms and single vertices.
+"""Compiled iterations of A-Jacobi, for springs, quadratic forms, inertia and pins.
 
 They are those of `springbench.solvers.methods.local_global.accelerated_local_global` in the same order of operations,
 with the matrix S of the sweeps in place of a factor.

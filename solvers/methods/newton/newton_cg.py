@@ -19,6 +19,7 @@ from typing import ClassVar
 import numpy as np
 from springbench.solvers.iteration.descent_method import (
     CompiledDescentState,
+    CompiledMethod,
     DescentPoint,
     PreparedDescent,
     ResidualMetric,
@@ -36,10 +37,8 @@ from springbench.solvers.iteration.preconditioners import (
 )
 from springbench.solvers.iteration.solver_info import Citation, SolverInfo
 from springbench.solvers.jit.typed_kernel import TypedKernel
-from springbench.solvers.kernels.descent_search import SearchArrays
-from springbench.solvers.linalg.cholesky.supernodal_cholesky import embed_factor
+from springbench.solvers.linalg.cholesky.supernodal_cholesky import SupernodalCholesky, embed_factor
 from springbench.solvers.linalg.krylov import NEGATIVE_CURVATURE, ConjugateGradientIteration
-from springbench.solvers.methods.newton import newton_cg_kernel
 from springbench.solvers.methods.newton.newton_cg_kernel import (
     MAX_CG_ITERATIONS,
     MAX_ETA,
@@ -47,6 +46,8 @@ from springbench.solvers.methods.newton.newton_cg_kernel import (
     NEWTON_CG_PROGRESS_DTYPE,
     NewtonCGArrays,
     NewtonEquation,
+    run_newton_cg,
+    solve_direction,
     update_eta,
 )
 from springbench.solvers.methods.newton.newton_direct import make_friction_search
@@ -120,8 +121,8 @@ class TruncatedNewtonIteration:
         self, metric: ResidualMetric, objective: FixedObjective, preconditioner: PreconditionerName = "cholesky"
     ) -> None:
         self._metric, self._linearise_at = metric, build_preconditioner(preconditioner, metric, objective, "newton-cg")
-        is_compiled = preconditioner == "cholesky" and metric.supernodal_factor is not None
-        self.compiled_cg = CompiledCG(metric) if is_compiled else None
+        factor = metric.supernodal_factor if preconditioner == "cholesky" else None
+        self.compiled_cg = _CompiledCG(metric.system, factor) if factor else None
         self._friction_search = make_friction_search(metric)
 
     def iterate_points(self, step: StepObjective, start: DescentPoint) -> Iterator[DescentPoint]:
@@ -255,64 +256,27 @@ class _NewtonSystemCG(ConjugateGradientIteration):
         return product <= self._limit
 
 
-class CompiledCG:
-    """Conjugate gradients in one kernel, for springs, quadratic forms and elements.
+class _CompiledCG:
+    """Conjugate gradients in one kernel, for springs, quadratic forms and elements."""
 
-    Without elements and in one thread, whole iterations of Newton-CG are compiled.
-
-    Attributes:
-        run_newton_cg: the compiled iterations.
-    """
-
-    def __init__(self, metric: ResidualMetric) -> None:
-        """Prepare the kernels.
-
-        Args:
-            metric: norm of residuals, whose factor kernels support.
-        """
-        factor, system = metric.supernodal_factor, metric.system
-        assert factor is not None
-        self._thread_count, self._factor = factor.choose_num_threads, embed_factor(factor, system.free_vertices)
-        self._exact_pins = system.pins.vertices[system.pins.exact_mask]
+    def __init__(self, system: System, factor: SupernodalCholesky) -> None:
+        self._thread_count, self._exact_pins = factor.choose_num_threads, system.pins.vertices[system.pins.exact_mask]
+        self._factor = embed_factor(factor, system.free_vertices)
         self._scratch = np.zeros((4, system.num_vertices, 3))
-        self._solve_usual = TypedKernel(newton_cg_kernel.solve_direction)
-        self.run_newton_cg = TypedKernel(newton_cg_kernel.run_newton_cg)
-
-    def build_arrays(self, search: SearchArrays) -> NewtonCGArrays:
-        """Build the arrays of compiled iterations in one thread.
-
-        Args:
-            search: arrays of the system.
-        """
-        linear = np.empty((len(search.objective_terms.stiffness), 4))
-        hessian = search.objective_terms, linear, search.quadratic_form, None, None
-        solving = self._factor, None, self._exact_pins, None
-        d = np.zeros_like(search.trial_positions)
-        return NewtonCGArrays(search, linear, NewtonEquation(hessian, *solving, d, *self._scratch))
+        self._solve_usual = TypedKernel(solve_direction)
 
     def compute_direction(
         self, hessian: Hessian, solve: Preconditioner, at: DescentPoint, descent: Positions, eta: float
     ) -> Positions:
-        """Solve H d = -g approximately.
-
-        Args:
-            hessian: H.
-            solve: preconditioner.
-            at: current point, with g.
-            descent: preconditioned gradient (n, 3) [m].
-            eta: tolerance relative to |g|.
-
-        Returns:
-            Direction d (n, 3) [m].
-        """
+        """Solve H d = -g approximately; `descent` is the preconditioned gradient."""
         d = np.empty_like(descent)
         shrunk = solve.inverse_scaling if isinstance(solve, ScaledPreconditioner) else None
         solving = self._factor, self._thread_count(), self._exact_pins, shrunk
         newton = NewtonEquation(hessian.kernel_arguments, *solving, d, *self._scratch)
         is_usual = shrunk is None and newton.num_threads is None and not hessian.element_hessians
-        solve_direction = self._solve_usual.call if is_usual else newton_cg_kernel.solve_direction
+        solve_equation = self._solve_usual.call if is_usual else solve_direction
         gradient = np.ascontiguousarray(at.gradient)
-        solve_direction(newton, gradient, np.ascontiguousarray(descent), eta, MAX_CG_ITERATIONS)
+        solve_equation(newton, gradient, np.ascontiguousarray(descent), eta, MAX_CG_ITERATIONS)
         return d
 
 
@@ -325,10 +289,17 @@ class PreparedTruncatedNewton(PreparedDescent):
     method: TruncatedNewtonIteration
 
     @cached_property
-    def compiled_arrays(self) -> NewtonCGArrays | None:
-        """Arrays of compiled iterations in one thread, or None if they are not supported."""
-        compiled, search = self.method.compiled_cg, self.metric.build_search_arrays(self.fixed_objective)
-        return compiled.build_arrays(search) if compiled and search else None
+    def compiled_method(self) -> CompiledMethod | None:
+        """The compiled iterations, or None if they are not supported."""
+        search = self.metric.build_search_arrays(self.fixed_objective) if self.method.compiled_cg else None
+        if search is None:
+            return None
+        linear = np.empty((len(search.objective_terms.stiffness), 4))
+        hessian = search.objective_terms, linear, search.quadratic_form, None, None
+        solving = search.residual_norm.factor, None, self.fixed_objective.exact_pins, None
+        vectors = np.zeros((5, self.metric.system.num_vertices, 3))
+        arrays = NewtonCGArrays(search, linear, NewtonEquation(hessian, *solving, *vectors))
+        return CompiledMethod(TypedKernel(run_newton_cg), arrays, 1, NEWTON_CG_PROGRESS_DTYPE)
 
     def init_state(self, problem: StepProblem, initial_guess: Positions) -> SolverState:
         """Start a solve.
@@ -337,8 +308,6 @@ class PreparedTruncatedNewton(PreparedDescent):
             problem: the step.
             initial_guess: positions (n, 3) [m], which are not modified.
         """
-        compiled, arrays = self.method.compiled_cg, self.compiled_arrays
-        if compiled is None or arrays is None or self.metric.is_threaded:
+        if self.compiled_method is None or self.metric.is_threaded:
             return super().init_state(problem, initial_guess)
-        step, start = self._build_step(problem, initial_guess)
-        return CompiledDescentState(compiled.run_newton_cg, arrays, step, start, 1, NEWTON_CG_PROGRESS_DTYPE)
+        return CompiledDescentState(self.compiled_method, *self._build_step(problem, initial_guess))

@@ -19,11 +19,11 @@ from springbench.solvers.kernels.descent_search import (
     SearchArrays,
     exceeds_roundoff,
     move_to_trial,
+    read_residual,
     search_backtracking,
 )
 from springbench.solvers.kernels.iteration_loop import build_compiled_loop
 from springbench.solvers.kernels.objective_kernels import compute_inner_product
-from springbench.solvers.kernels.residual_norm import compute_norm_of_correction
 from springbench.solvers.kernels.spring_hessian import linearise_springs, multiply_hessian
 from springbench.solvers.linalg.cholesky.triangular_solve import SupernodalFactor, solve_supernodal
 from springbench.solvers.linalg.krylov import NEGATIVE_CURVATURE, compile_cg_loop
@@ -156,7 +156,8 @@ NEWTON_CG_PROGRESS_DTYPE = np.dtype(
     [
         ("is_started", np.int64),
         ("eta", np.float64),  # tolerance of the next direction, relative to |g|
-        ("residual", np.float64),  # at the current point [J^(1/2)]; negative: not yet known
+        ("has_residual", np.int64),  # whether the residual at the current point is known
+        ("residual", np.float64),  # [J^(1/2)]
     ]
 )
 """The progress of a solve."""
@@ -210,17 +211,14 @@ def _take_step(state):
     move_to_trial(arrays.search, p, gradient)
     solve_supernodal(newton.factor, gradient, descent, None)
     now.eta = update_eta(now.eta, compute_inner_product(gradient, descent), product, MAX_ETA)
-    now.residual = -1.0
+    now.has_residual = 0
     return True
 
 
 @jit_inner
 def _compute_residual(state):
     arrays, _, _, _, gradient, descent, progress = state
-    now = progress[0]
-    if now.residual < 0.0:
-        now.residual = compute_norm_of_correction(arrays.search.residual_norm, descent, gradient)
-    return now.residual
+    return read_residual(arrays.search, descent, gradient, progress)
 
 
 _newton_loop = build_compiled_loop(_take_step, _compute_residual)
@@ -245,5 +243,5 @@ def run_newton_cg(arrays, step_data, exact_pins, limits, p, gradient, descent, p
     """
     if progress[0].is_started == 0:
         solve_supernodal(arrays.equation.factor, gradient, descent, None)
-        progress[0].is_started, progress[0].eta, progress[0].residual = 1, MAX_ETA, -1.0
+        progress[0].is_started, progress[0].eta = 1, MAX_ETA
     return _newton_loop((arrays, step_data, exact_pins, p, gradient, descent, progress), limits)

@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 from springbench.solvers.contact.half_space.vertex_contact import is_vertex_contact
 from springbench.solvers.iteration.descent_method import (
     CompiledDescentState,
+    CompiledMethod,
     DescentPoint,
     PreparedDescent,
     ResidualMetric,
@@ -39,7 +40,7 @@ from springbench.solvers.iteration.iterative_solver import SolverState
 from springbench.solvers.iteration.solver_info import Citation, SolverInfo
 from springbench.solvers.jit.typed_kernel import TypedKernel
 from springbench.solvers.kernels.iteration_loop import REASON_ITERATIONS, RESIDUAL_EACH, LoopLimits, check_residual
-from springbench.solvers.methods.newton import newton_kernel
+from springbench.solvers.linalg.cholesky.block_cholesky import BlockCholesky
 from springbench.solvers.methods.newton.hessian_regularisation import (
     REGULARISATION_RULES,
     SHIFT_SCHEDULE,
@@ -49,7 +50,7 @@ from springbench.solvers.methods.newton.hessian_regularisation import (
     ShiftScheduleRule,
 )
 from springbench.solvers.methods.newton.negative_curvature import escape_saddle, is_positive_definite
-from springbench.solvers.methods.newton.newton_kernel import NEWTON_PROGRESS_DTYPE, NewtonArrays
+from springbench.solvers.methods.newton.newton_kernel import NEWTON_PROGRESS_DTYPE, NewtonArrays, run_exact_steps
 from springbench.solvers.model.barrier_energy import is_barrier_energy
 from springbench.solvers.model.step_problem import Positions, PreparedSolver, StepProblem, System, Unsupported
 from springbench.solvers.objective.fixed_objective import FixedObjective
@@ -120,20 +121,16 @@ class PreparedExactNewton(PreparedDescent):
     method: NewtonIteration
 
     @cached_property
-    def compiled_arrays(self) -> NewtonArrays | None:
-        """Arrays of compiled iterations in one thread, or None if they are not supported."""
+    def compiled_method(self) -> CompiledMethod | None:
+        """The compiled iterations, or None if they are not supported."""
         search = self.metric.build_search_arrays(self.fixed_objective) if self.method.regularises_by_schedule else None
         if search is None:
             return None
         matrix, system = self.fixed_objective.hessian_matrix, self.metric.system
         blocks = matrix.block_indices, matrix.constant_blocks, np.empty(0), matrix.values
         scratch = np.empty((len(system.free_vertices), 3)), np.zeros((system.num_vertices, 3))
-        return NewtonArrays(search, *blocks, matrix.factor.kernel_factor, *scratch)
-
-    @cached_property
-    def run_exact_steps(self) -> TypedKernel:
-        """The compiled iterations."""
-        return TypedKernel(newton_kernel.run_exact_steps)
+        arrays = NewtonArrays(search, *blocks, matrix.factor.kernel_factor, *scratch)
+        return CompiledMethod(TypedKernel(run_exact_steps), arrays, 0, NEWTON_PROGRESS_DTYPE)
 
     def init_state(self, problem: StepProblem, initial_guess: Positions) -> SolverState:
         """Start a solve.
@@ -142,19 +139,27 @@ class PreparedExactNewton(PreparedDescent):
             problem: the step.
             initial_guess: positions (n, 3) [m], which are not modified.
         """
-        if self.compiled_arrays is None or self.fixed_objective.hessian_matrix.factor.num_threads > 1:
+        factor = self.fixed_objective.hessian_matrix.factor
+        if self.compiled_method is None or factor.num_threads > 1:
             return super().init_state(problem, initial_guess)
-        return _CompiledNewtonState(self, self.compiled_arrays, *self._build_step(problem, initial_guess))
+        return _CompiledNewtonState(
+            self.compiled_method, self.method, factor, *self._build_step(problem, initial_guess)
+        )
 
 
 class _CompiledNewtonState(CompiledDescentState):
     """The state of a solve with compiled iterations where the exact Hessian has a factor."""
 
     def __init__(
-        self, prepared: PreparedExactNewton, arrays: NewtonArrays, step: StepObjective, start: DescentPoint
+        self,
+        compiled: CompiledMethod,
+        method: NewtonIteration,
+        factor: BlockCholesky,
+        step: StepObjective,
+        start: DescentPoint,
     ) -> None:
-        super().__init__(prepared.run_exact_steps, arrays, step, start, 0, NEWTON_PROGRESS_DTYPE)
-        self._method, self._factor = prepared.method, prepared.fixed_objective.hessian_matrix.factor
+        super().__init__(compiled, step, start)
+        self._method, self._factor = method, factor
 
     def run_iterations(self, limits: LoopLimits) -> tuple[int, float, int]:
         """Iterate up to the limits; return count, residual and reason."""
@@ -178,14 +183,14 @@ class _CompiledNewtonState(CompiledDescentState):
 
     def _take_regularised_step(self) -> bool:
         """Do a step where the exact Hessian has no factor; return whether the positions changed."""
-        at, progress = DescentPoint(self.positions.copy(), self.gradient.copy()), self.progress
+        at, progress = DescentPoint(self.positions, self.gradient), self.progress
         steepest = float(progress["steepest_slope"][0])
         found, progress["steepest_slope"] = self._method.next_point(self._step, at, steepest, ShiftScheduleRule(1))
         if found.is_stalled:
             progress["is_stalled"] = 1
             return False
         self.positions[:], self.gradient[:] = found.positions, found.gradient
-        progress["residual"] = -1.0
+        progress["has_residual"] = 0
         return True
 
     def can_terminate(self) -> bool:

@@ -27,12 +27,12 @@ from springbench.solvers.linalg.cholesky.block_multifrontal import run_stages
 
 NEWTON_PROGRESS_DTYPE = np.dtype(
     [
-        ("is_started", np.int64),
         ("is_stalled", np.int64),  # whether round-off prevents descent from the current point
         ("num_factorisations", np.int64),  # that succeeded in the last call
         ("failed_supernode", np.int64),  # at which the last one failed in the last call, -1 for none
         ("steepest_slope", np.float64),  # of the solve [J], positive
-        ("residual", np.float64),  # at the current point [J^(1/2)]; negative: not yet known
+        ("has_residual", np.int64),  # whether the residual at the current point is known
+        ("residual", np.float64),  # [J^(1/2)]
     ]
 )
 """The progress of a solve."""
@@ -81,7 +81,7 @@ def _take_exact_step(state):
         now.is_stalled = 1
         return False
     move_to_trial(arrays.search, p, gradient)
-    now.residual = -1.0
+    now.has_residual = 0
     return True
 
 
@@ -115,8 +115,8 @@ def _factorise_and_solve(arrays, p, gradient):
 def _compute_residual(state):
     arrays, _, _, _, gradient, progress = state
     now = progress[0]
-    if now.residual < 0.0:
-        now.residual = compute_residual_norm(arrays.search.residual_norm, gradient)
+    if now.has_residual == 0:
+        now.residual, now.has_residual = compute_residual_norm(arrays.search.residual_norm, gradient), 1
     return now.residual
 
 
@@ -141,8 +141,5 @@ def run_exact_steps(arrays, step_data, exact_pins, limits, p, gradient, progress
     Returns:
         Number of iterations, last residual [J^(1/2)] and termination reason.
     """
-    now = progress[0]
-    now.num_factorisations, now.failed_supernode = 0, -1
-    if now.is_started == 0:
-        now.is_started, now.residual = 1, -1.0
+    progress[0].num_factorisations, progress[0].failed_supernode = 0, -1
     return _iterate_loop((arrays, step_data, exact_pins, p, gradient, progress), limits)

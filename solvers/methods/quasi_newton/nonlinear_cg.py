@@ -24,6 +24,7 @@ import numpy as np
 from springbench.solvers.contact.half_space.vertex_contact import without_vertex_contact
 from springbench.solvers.iteration.descent_method import (
     CompiledDescentState,
+    CompiledMethod,
     DescentPoint,
     ResidualMetric,
     backtracking_line_search,
@@ -38,8 +39,11 @@ from springbench.solvers.iteration.preconditioners import (
 )
 from springbench.solvers.iteration.solver_info import Citation, SolverInfo
 from springbench.solvers.jit.typed_kernel import TypedKernel
-from springbench.solvers.methods.quasi_newton import nonlinear_cg_kernel
-from springbench.solvers.methods.quasi_newton.nonlinear_cg_kernel import CONJUGATE_PROGRESS_DTYPE, NonlinearCGArrays
+from springbench.solvers.methods.quasi_newton.nonlinear_cg_kernel import (
+    CONJUGATE_PROGRESS_DTYPE,
+    NonlinearCGArrays,
+    run_nonlinear_cg,
+)
 from springbench.solvers.model.step_problem import Positions, PreparedSolver, StepProblem, System, Unsupported
 from springbench.solvers.objective.fixed_objective import FixedObjective
 from springbench.solvers.objective.step_objective import StepObjective
@@ -115,25 +119,22 @@ class PreparedNonlinearCG(IterativeSolver):
             problem: step whose objective is minimised.
             initial_guess: positions (n, 3) [m], not modified.
         """
-        step, arrays = StepObjective(self.fixed_objective, problem), self.compiled_arrays
+        step = StepObjective(self.fixed_objective, problem)
         p = step.apply_exact_pins(initial_guess)
         start = DescentPoint(p, step.gradient(p))
-        if arrays is None or self.metric.is_threaded:
+        if self.compiled_method is None or self.metric.is_threaded:
             return _NonlinearCGState(self.metric, self.linearise_at, step, start)
-        return CompiledDescentState(self._run_nonlinear_cg, arrays, step, start, 2, CONJUGATE_PROGRESS_DTYPE)
+        return CompiledDescentState(self.compiled_method, step, start)
 
     @cached_property
-    def compiled_arrays(self) -> NonlinearCGArrays | None:
-        """Arrays of compiled iterations in one thread, or None if they are not supported."""
-        if self.preconditioner != "cholesky" or not (search := self.metric.build_search_arrays(self.fixed_objective)):
+    def compiled_method(self) -> CompiledMethod | None:
+        """The compiled iterations, or None if they are not supported."""
+        search = self.metric.build_search_arrays(self.fixed_objective) if self.preconditioner == "cholesky" else None
+        if search is None:
             return None
         linear = np.empty((len(search.objective_terms.stiffness), 4))
-        scratch = [np.empty_like(search.trial_positions) for _ in range(3)]
-        return NonlinearCGArrays(search, linear, *scratch)
-
-    @cached_property
-    def _run_nonlinear_cg(self) -> TypedKernel:
-        return TypedKernel(nonlinear_cg_kernel.run_nonlinear_cg)
+        arrays = NonlinearCGArrays(search, linear, *[np.empty_like(search.trial_positions) for _ in range(3)])
+        return CompiledMethod(TypedKernel(run_nonlinear_cg), arrays, 2, CONJUGATE_PROGRESS_DTYPE)
 
     def residual_scale(self, problem: StepProblem) -> float:
         """Return the residual scale [J^(1/2)] for the round-off check."""

@@ -14,11 +14,11 @@ from springbench.solvers.kernels.descent_search import (
     SearchArrays,
     exceeds_roundoff,
     move_to_trial,
+    read_residual,
     search_backtracking,
 )
 from springbench.solvers.kernels.iteration_loop import build_compiled_loop
 from springbench.solvers.kernels.objective_kernels import compute_inner_product
-from springbench.solvers.kernels.residual_norm import compute_norm_of_correction
 from springbench.solvers.kernels.spring_hessian import linearise_springs, multiply_hessian
 from springbench.solvers.linalg.cholesky.triangular_solve import solve_supernodal
 
@@ -26,7 +26,8 @@ CONJUGATE_PROGRESS_DTYPE = np.dtype(
     [
         ("is_started", np.int64),
         ("beta", np.float64),  # multiple of the last direction in the next one
-        ("residual", np.float64),  # at the current point [J^(1/2)]; negative: not yet known
+        ("has_residual", np.int64),  # whether the residual at the current point is known
+        ("residual", np.float64),  # [J^(1/2)]
     ]
 )
 """The progress of a solve."""
@@ -104,7 +105,7 @@ def _accept_trial(state):
     for v in range(len(p)):
         for c in range(3):
             w[v, c] = correction[v, c] - w[v, c]
-    now.beta, now.residual = 0.0, -1.0
+    now.beta, now.has_residual = 0.0, 0
     change = compute_inner_product(direction, y)
     if change > 0.0:
         slope = compute_inner_product(gradient, direction)
@@ -115,10 +116,7 @@ def _accept_trial(state):
 @jit_inner
 def _compute_residual(state):
     arrays, _, _, _, gradient, correction, _, progress = state
-    now = progress[0]
-    if now.residual < 0.0:
-        now.residual = compute_norm_of_correction(arrays.search.residual_norm, correction, gradient)
-    return now.residual
+    return read_residual(arrays.search, correction, gradient, progress)
 
 
 _conjugate_loop = build_compiled_loop(_take_step, _compute_residual)
@@ -142,8 +140,7 @@ def run_nonlinear_cg(arrays, step_data, exact_pins, limits, p, gradient, correct
     Returns:
         Number of iterations, last residual [J^(1/2)] and termination reason.
     """
-    now = progress[0]
-    if now.is_started == 0:
+    if progress[0].is_started == 0:
         solve_supernodal(arrays.search.residual_norm.factor, gradient, correction, None)
-        now.is_started, now.residual = 1, -1.0
+        progress[0].is_started = 1
     return _conjugate_loop((arrays, step_data, exact_pins, p, gradient, correction, direction, progress), limits)
