@@ -152,16 +152,18 @@ def spring_direction(terms, e, p):
 
 
 @jit_kernel
-def gradient(terms, step_data, p, out):
-    """Write the gradient of springs, inertia, force and penalty pins.
+def gradient(terms, form, step_data, exact_pins, p, out):
+    """Write the gradient of springs, a quadratic form and single vertices.
 
     Args:
         terms: objective terms.
+        form: quadratic form, or None.
         step_data: data of the step.
+        exact_pins: exactly pinned vertices.
         p: positions (n, 3) [m].
-        out: output (n, 3) [N], overwritten; not zero at exactly pinned vertices.
+        out: output (n, 3) [N], overwritten; zero at exactly pinned vertices.
     """
-    _write_gradient(terms, step_data, p, out)
+    write_free_gradient(terms, form, step_data, exact_pins, p, out)
 
 
 @jit_inner
@@ -237,15 +239,16 @@ def row_norm(x, v):
 
 
 @jit_kernel
-def objective_change(terms, step_data, p, q):
-    """Return g(q) - g(p) [J] of springs, inertia, force and penalty pins.
+def objective_change(terms, form, step_data, p, q):
+    """Return g(q) - g(p) [J] of springs, a quadratic form and single vertices.
 
     Args:
         terms: objective terms.
+        form: quadratic form, or None.
         step_data: data of the step.
         p, q: positions (n, 3) [m], before and after.
     """
-    return _change_objective(terms, step_data, p, q)
+    return change_objective(terms, form, step_data, p, q)
 
 
 @jit_inner

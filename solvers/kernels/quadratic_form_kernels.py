@@ -43,18 +43,6 @@ class QuadraticForm(NamedTuple):
         return cls(np.empty((0, 2), np.int64), np.empty(0), np.empty(0))
 
 
-@jit_kernel
-def add_gradient(form, p, out):
-    """Add the gradient L p of a form.
-
-    Args:
-        form: the form.
-        p: positions (n, 3) [m].
-        out: (n, 3) [N], updated.
-    """
-    _add_product(form, p, out)
-
-
 @jit_inner
 def add_product(form, x, out):
     """Add the product L x; do nothing without a form.
@@ -85,17 +73,6 @@ def _add_product(form, x, out):
         out[j, 0] -= f0
         out[j, 1] -= f1
         out[j, 2] -= f2
-
-
-@jit_kernel
-def energy_change(form, p, q):
-    """Return the change q'Lq/2 - p'Lp/2 [J] of a form's energy.
-
-    Args:
-        form: the form.
-        p, q: positions (n, 3) [m], before and after.
-    """
-    return change_form(form, p, q)
 
 
 @jit_inner

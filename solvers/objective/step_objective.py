@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from springbench.solvers.jit.typed_kernel import as_kernel_array
-from springbench.solvers.kernels import objective_kernels, quadratic_form_kernels, spring_hessian
+from springbench.solvers.kernels import objective_kernels, spring_hessian
 from springbench.solvers.linalg.cholesky.block_cholesky import BlockCholesky
 from springbench.solvers.model.barrier_energy import BarrierEnergy, PairBlocks, is_barrier_energy, max_step_size
 from springbench.solvers.model.energies.element_energies import JoinedElements, add_blocks
@@ -184,14 +184,13 @@ class StepObjective:
         """Return the gradient [N], (n, 3), zero at exactly pinned vertices."""
         p, fixed = np.ascontiguousarray(p), self.fixed_objective
         out = np.empty_like(p)
-        fixed.kernels.gradient.call(fixed.objective_terms, self.step_data, p, out)
-        if fixed.quadratic_form is not None:
-            quadratic_form_kernels.add_gradient(fixed.quadratic_form, p, out)
-        for one in self.element_energies:
-            one.element_law.add_gradient(one.elements, p, out)
-        for energy in self.other_energies:
-            energy.add_gradient(p, out)
-        if self._has_exact_pins:
+        terms = fixed.objective_terms, fixed.quadratic_form, self.step_data, self.exact_pins
+        fixed.kernels.gradient.call(*terms, p, out)
+        if self.element_energies or self.other_energies:
+            for one in self.element_energies:
+                one.element_law.add_gradient(one.elements, p, out)
+            for energy in self.other_energies:
+                energy.add_gradient(p, out)
             out[self._exact_pins] = 0.0
         return out
 
@@ -208,9 +207,8 @@ class StepObjective:
             g(q) - g(p) [J], and the part that may be round-off of energies without an element-wise form [J].
         """
         p, q, fixed = np.ascontiguousarray(p), np.ascontiguousarray(q), self.fixed_objective
-        change, noise = fixed.kernels.objective_change.call(fixed.objective_terms, self.step_data, p, q), 0.0
-        if fixed.quadratic_form is not None:
-            change += quadratic_form_kernels.energy_change(fixed.quadratic_form, p, q)
+        terms, noise = (fixed.objective_terms, fixed.quadratic_form, self.step_data), 0.0
+        change = fixed.kernels.objective_change.call(*terms, p, q)
         for one in self.element_energies:
             change += one.element_law.energy_change(one.elements, p, q)
         for energy in self.other_energies:

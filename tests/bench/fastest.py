@@ -31,7 +31,6 @@ import argparse
 import gc
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
-from itertools import islice
 from pathlib import Path
 from time import thread_time
 from typing import NamedTuple
@@ -209,18 +208,16 @@ def find_first_iterates(
     return found, spent <= time_limit
 
 
-def measure_iterate_seconds(prepared: PreparedSolver, problem: StepProblem, numbers: Sequence[int]) -> list[float]:
-    """Measure the thread's processor time [s] up to each of the iterates with these ascending numbers."""
-    timed, found = set(numbers), dict[int, float]()
+def measure_solve_seconds(prepared: PreparedSolver, problem: StepProblem, num_iterations: int) -> float:
+    """Measure the thread's processor time [s] of a solve with this number of iterations."""
+    stop = StopRule(num_iterations)
     gc.disable()  # otherwise the time of a garbage collection would be attributed to the solver
     try:
         began = thread_time()
-        for number, _ in enumerate(islice(prepared.iterates(problem), numbers[-1]), 1):
-            if number in timed:
-                found[number] = thread_time() - began
+        prepared.solve(problem, stop)
+        return thread_time() - began
     finally:
         gc.enable()
-    return [found[number] for number in numbers]
 
 
 def measure_interleaved(
@@ -231,8 +228,8 @@ def measure_interleaved(
     for round_number in range(-1, rounds):  # the first round is a warm-up
         for one in candidates if round_number % 2 else candidates[::-1]:
             numbers = sorted(set(one.num_iterations.values()))
-            measure_iterate_seconds(one.prepared, problem, numbers)  # fills the caches
-            by_number = dict(zip(numbers, measure_iterate_seconds(one.prepared, problem, numbers), strict=True))
+            measure_solve_seconds(one.prepared, problem, numbers[-1])  # fills the caches
+            by_number = {number: measure_solve_seconds(one.prepared, problem, number) for number in numbers}
             for target, number in one.num_iterations.items() if round_number >= 0 else ():
                 times[one.name][target].append(by_number[number])
     return {

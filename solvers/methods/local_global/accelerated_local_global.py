@@ -9,7 +9,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from dataclasses import dataclass
 from operator import attrgetter
-from typing import Any, Protocol
+from typing import Any, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,6 +54,10 @@ class AcceleratedState(SolverState):
     @abstractmethod
     def gradient(self) -> Positions:
         """Return the gradient of the objective [N], (n, 3), at the iterate."""
+
+    @abstractmethod
+    def restart_at(self, p: Positions) -> Self:
+        """Return a state of the same step that starts at positions p (n, 3) [m]; this one must not be used again."""
 
     def run_rounds(self, rounds: NDArray[Any], limits: LoopLimits) -> tuple[int, float, int]:
         """Run rounds of iterations.
@@ -132,7 +136,7 @@ class InterpretedState(AcceleratedState):
         self, base: PreparedLocalGlobal, scheme: AccelerationScheme, objective: StepObjective, guess: Positions
     ) -> None:
         window = allocate_window(scheme, guess.size, guess.size)
-        self._base, self._window, self._objective = base, window, objective
+        self._base, self._scheme, self._window, self._objective = base, scheme, window, objective
         self.positions, self._trial_positions, self._trial_descent = (
             x.reshape(-1, 3) for x in (window.position, window.trial_position, window.trial_descent)
         )
@@ -140,6 +144,10 @@ class InterpretedState(AcceleratedState):
         self._trial_positions[:] = objective.apply_exact_pins(guess)
         self._evaluate_trial()
         _init_window.call(window, self._solve_trial())
+
+    def restart_at(self, p: Positions) -> Self:
+        """Return a state of the same step that starts at positions p (n, 3) [m]."""
+        return type(self)(self._base, self._scheme, self._objective, p)
 
     def step_state(self) -> bool:
         """Do one iteration; return False if round-off prevents descent."""

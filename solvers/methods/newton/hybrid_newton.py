@@ -92,8 +92,16 @@ from springbench.solvers.methods.newton.negative_curvature import (
     is_positive_definite,
     probe_negative_curvature,
 )
-from springbench.solvers.methods.newton.newton_direct import NewtonIteration
-from springbench.solvers.methods.newton.predicted_tension import PredictedTensionNewton, compute_objective_decrease
+from springbench.solvers.methods.newton.newton_direct import NewtonIteration, build_newton_arrays
+from springbench.solvers.methods.newton.newton_kernel import (
+    MODEL_RANGE,
+    NEWTON_PROGRESS_DTYPE,
+)
+from springbench.solvers.methods.newton.predicted_tension import (
+    CompiledNewton,
+    PredictedTensionNewton,
+    compute_objective_decrease,
+)
 from springbench.solvers.methods.quasi_newton.lbfgs import Lbfgs
 from springbench.solvers.methods.quasi_newton.lbfgs_with_sweeps import LbfgsSweepEngine, LbfgsSweepState
 from springbench.solvers.methods.quasi_newton.sweep_rounds import ROUND_SWEEPS
@@ -116,12 +124,11 @@ _FLOAT32_CONDITION = 0.1 / float(np.finfo(np.float32).eps)
 _FIRST_PATIENCE = 10.0
 """Initial multiple of the cost of an attempt, after which the exact method is tried again."""
 
-_MODEL_RANGE = (0.3, 0.7)
-"""Range of the decrease, as a fraction of the slope, in which a step agrees with the quadratic model: half of it for a
-full step on a quadratic function, three quarters for half a step."""
-
 _MEASURED_STEPS = 3
 """Number of consecutive steps of a Newton method whose decrease per cost is compared: single steps vary widely."""
+
+_MAX_COMPILED_STEPS = 16
+"""Maximum number of steps of Newton's method in one call of a kernel."""
 
 _MAX_SHIFT = 1e3
 """Largest multiple of the inertia that is added to an exact Hessian; then its negative parts are reduced instead."""
@@ -480,6 +487,7 @@ class MeasuredRule(ShiftScheduleRule):
         agrees_with_model: whether the Hessian of the last step was unmodified and its decrease agreed with the model.
         decrement_ratio: ratio of the squared Newton decrements g'H^-1 g after and before a step that agreed.
         is_exact_only: whether only the unmodified Hessian may be factorised.
+        is_indefinite: whether the exact Hessian at the next point is known to have no factor.
         decrease: decrease of the objective in the last step [J]; None before it, and if there was none.
     """
 
@@ -494,7 +502,7 @@ class MeasuredRule(ShiftScheduleRule):
         self._shift, self._level, self._before = InertiaShift(0.0, _MAX_SHIFT), cast(int | None, None), 0.0
         self._gains = {"shift": np.inf, "schedule": np.inf}  # [J] per factorisation, when last used
         self._name = "shift"
-        self.agrees_with_model = self.is_exact_only = False
+        self.agrees_with_model = self.is_exact_only = self.is_indefinite = False
         self.decrement_ratio, self.decrease = 0.0, cast(float | None, None)
 
     def factorise_hessian(self, hessian: Hessian, at: DescentPoint, diagonal: NDArray[np.float64]) -> int | None:
@@ -511,12 +519,18 @@ class MeasuredRule(ShiftScheduleRule):
         self.agrees_with_model, self.decrease, self._before = False, None, self._factor.num_factorisations
         self._name = max(self._gains, key=lambda name: self._gains[name])
         if self.is_exact_only:
-            self._level = 0 if hessian.factorise() else None
+            self._level = None if self.is_indefinite or not hessian.factorise() else 0
         elif self._name == "schedule":
-            self._level = factorise_shifted(hessian, diagonal)
+            self._level = factorise_shifted(hessian, diagonal, first_level=int(self.is_indefinite))
         else:
             self._level = self._shift.find_smallest(lambda shift: self._factorise_shifted(hessian, diagonal, shift))
+        self.is_indefinite = False
         return self._level
+
+    @property
+    def tries_exact_first(self) -> bool:
+        """Whether the exact Hessian is the first to be factorised at the next point."""
+        return self.is_exact_only or self._gains["schedule"] > self._gains["shift"] or self._shift.value == 0.0
 
     def _factorise_shifted(self, hessian: Hessian, diagonal: NDArray[np.float64], shift: float) -> int | None:
         """Factorise with a multiple of the inertia added.
@@ -525,6 +539,8 @@ class MeasuredRule(ShiftScheduleRule):
         """
         if shift == np.inf:
             return factorise_shifted(hessian, diagonal, first_level=1)
+        if shift == 0.0 and self.is_indefinite:
+            return None
         added = shift * self._inertia_diagonal if shift > 0.0 else 0.0
         return int(shift > 0.0) if hessian.factorise(1.0, added) else None
 
@@ -539,14 +555,31 @@ class MeasuredRule(ShiftScheduleRule):
         """
         slope = inner_product(at.gradient, at.positions - to.positions)
         self.decrease = fall = compute_objective_decrease(step, at, to)
-        low, high = _MODEL_RANGE
-        if self._name == "shift":
-            self._shift.can_reduce = fall >= MODEL_DECREASE_FRACTION * slope or self._shift.value == np.inf
+        low, high = MODEL_RANGE
+        self._record_decrease(fall, slope)
         if self._level:
             self._gains[self._name] = fall / (self._factor.num_factorisations - self._before)
         self.agrees_with_model = self._level == 0 and (fall == 0.0 or low * slope <= fall <= high * slope)
         if self.agrees_with_model and slope > 0.0:
             self.decrement_ratio = inner_product(to.gradient, hessian.solve(to.gradient)) / slope
+
+    def record_compiled_steps(self, progress: NDArray[Any], decrease: float) -> None:
+        """Record the last of several steps with the exact Hessian.
+
+        Args:
+            progress: progress of the solve (1,) after the steps.
+            decrease: decrease of the objective in the last one [J].
+        """
+        last = progress[0]
+        self._name = max(self._gains, key=lambda name: self._gains[name])
+        self._record_decrease(decrease, float(last["slope"]))
+        self.agrees_with_model = bool(last["agrees_with_model"])
+        self.decrement_ratio = float(last["decrement_ratio"])
+
+    def _record_decrease(self, decrease: float, slope: float) -> None:
+        """Record whether the quadratic model was accurate in a step."""
+        if self._name == "shift":
+            self._shift.can_reduce = decrease >= MODEL_DECREASE_FRACTION * slope or self._shift.value == np.inf
 
 
 class HybridIteration:
@@ -571,7 +604,7 @@ class HybridIteration:
     def __init__(
         self, objective: FixedObjective, metric: ResidualMetric, lbfgs: PreparedAccelerated, is_double: bool
     ) -> None:
-        self.metric, self._lbfgs = metric, lbfgs
+        self.metric, self._lbfgs, self._objective = metric, lbfgs, objective
         self.newton = NewtonIteration(metric, has_local_roundoff=True)
         self.system_diagonal: NDArray[np.float64] = np.repeat(metric.free_diagonal, 3)
         inertia = objective.system.inertia_diagonal[objective.system.free_vertices]
@@ -600,6 +633,16 @@ class HybridIteration:
         check_cost = _COLLISION_CHECK_COST if objective.has_barriers else _ROUND_END_COST
         rounds = init_rounds(self.newton_cost, check_cost, self.sweep_cost, starts_sweeping=self.starts_sweeping)
         self._initial_rounds = rounds.tobytes()
+
+    @property
+    def compiled_newton(self) -> CompiledNewton | None:
+        """Compiled steps of Newton's methods; None if they are not supported, and with several threads."""
+        return self._compiled_newton if self.factor.num_threads == 1 else None
+
+    @cached_property
+    def _compiled_newton(self) -> CompiledNewton | None:
+        arrays = build_newton_arrays(self.metric, self._objective)
+        return None if arrays is None else CompiledNewton.from_arrays(arrays)
 
     def init_rounds(self) -> NDArray[Any]:
         """Return the state of the rounds of a solve."""
@@ -705,16 +748,19 @@ class HybridIteration:
             step: objective of the step.
             at: point at which the phases are evaluated.
         """
-        return self.newton.iteration_phases(step, at) | {"lbfgs": lambda: self.relax_point(step, at.positions)}
 
-    def relax_point(self, step: StepObjective, p: Positions) -> DescentPoint:
+        def run_lbfgs() -> DescentPoint:
+            return self.relax_point(self.start_lbfgs(step, at.positions), step)
+
+        return self.newton.iteration_phases(step, at) | {"lbfgs": run_lbfgs}
+
+    def relax_point(self, run: AcceleratedState, step: StepObjective) -> DescentPoint:
         """Return the point after a few iterations of L-BFGS.
 
         Args:
-            step: objective of the step, whose barrier energies are ignored.
-            p: positions (n, 3) [m] from which L-BFGS starts.
+            run: state of L-BFGS at the start of a solve.
+            step: objective of the step.
         """
-        run = self.start_lbfgs(step, p)
         run.run_iterations(LoopLimits(_RELAXATION_ITERATIONS, 0.0, 0.0, RESIDUAL_NEVER))
         return self.read_point(step, run)
 
@@ -769,6 +815,7 @@ class MethodChoice:
         self._name = ""
         self._was_indefinite = False
         self._recent_steps: deque[tuple[float, float]] = deque(maxlen=_MEASURED_STEPS)  # [J], cost
+        self._decreases = np.empty(_MAX_COMPILED_STEPS)  # [J] in the last compiled steps of the exact method
         self._is_trial_due, self._patience, self._spent, self._fallen = False, _FIRST_PATIENCE, 0.0, 0.0
         self._trial_cost = _FIRST_PATIENCE * method.newton_cost  # spent by the others until the exact method is tried
 
@@ -790,9 +837,7 @@ class MethodChoice:
                     if self._run is not None:  # the gradient of L-BFGS has the round-off of its kernel
                         positions = self._point.positions
                         self._point, self._run = DescentPoint(positions, self._step.gradient(positions)), None
-                    before = self._method.factor.num_factorisations
-                    point, fall = self._take_newton_step() if name == "newton" else self._take_predicted_step()
-                    self._record_step(name, point, fall, self._method.factor.num_factorisations - before)
+                    point = self._take_exact_steps() if name == "newton" else self._take_predicted_step()
             if point is not self._point:
                 self._point, self._control.is_minimum = point, self._agrees_with_model
                 yield point
@@ -817,8 +862,13 @@ class MethodChoice:
         """
         if not self._agrees_with_model:
             return False
-        ratio, other = self._rule.decrement_ratio, float(self._rounds["gain_ratio"][0])
-        return not 0.0 < other < 1.0 or ratio <= other**self._method.newton_cost
+        return self._rule.decrement_ratio <= self._max_decrement_ratio
+
+    @property
+    def _max_decrement_ratio(self) -> float:
+        """Ratio of squared decrements up to which Newton's method converges faster than L-BFGS did."""
+        other = float(self._rounds["gain_ratio"][0])
+        return other**self._method.newton_cost if 0.0 < other < 1.0 else np.inf
 
     def _choose_method(self) -> str:
         if self._converges_faster or self._is_trial_due or not any(self._gains.values()):
@@ -872,35 +922,73 @@ class MethodChoice:
         elif ended == REASON_STALLED or residual <= self._floor:
             self._gains["lbfgs"], self._is_trial_due = 0.0, True
 
-    def _take_newton_step(self) -> tuple[DescentPoint, float]:
-        """Return the point after an exact step, and the decrease of the objective [J].
+    def _take_exact_steps(self) -> DescentPoint:
+        """Return the point after steps of the exact method.
 
-        If the exact Hessian has no factor, the current point is returned. Predicted tensions follow from the second
-        time on, or if L-BFGS has ended. The first time, L-BFGS has often not yet reached a convex region, and the next
-        attempt comes sooner.
+        They are compiled if they are supported, and as long as the exact Hessian has a factor.
+
+        If it has none, the current point is returned. Predicted tensions follow from the second time on, or if L-BFGS
+        has ended. The first time, L-BFGS has often not yet reached a convex region, and the next attempt comes sooner.
         """
-        self._rule.is_exact_only = self._predicting is None and any(self._gains.values())
-        point, self._steepest = self._method.newton.next_point(self._step, self._point, self._steepest, self._rule)
-        if point.is_stalled and self._rule.is_exact_only:
+        method, rule, before = self._method, self._rule, self._method.factor.num_factorisations
+        rule.is_exact_only = self._predicting is None and any(self._gains.values())
+        if method.compiled_newton is not None and rule.tries_exact_first:
+            point = self._run_compiled_steps(method.compiled_newton)
+            if point is not self._point:
+                return point
+        point, self._steepest = method.newton.next_point(self._step, self._point, self._steepest, rule)
+        if point.is_stalled and rule.is_exact_only:
             if self._was_indefinite or self._gains["lbfgs"] == 0.0:
                 self._gains["predicted tensions"] = np.inf
             else:
                 self._was_indefinite, self._patience = True, 0.5 * self._patience
-            return self._point, 0.0
-        fall = self._rule.decrease
-        return point, compute_objective_decrease(self._step, self._point, point) if fall is None else fall
+            point, fall = self._point, 0.0
+        elif rule.decrease is None:
+            fall = compute_objective_decrease(self._step, self._point, point)
+        else:
+            fall = rule.decrease
+        self._record_step("newton", point, fall, method.factor.num_factorisations - before)
+        return point
 
-    def _take_predicted_step(self) -> tuple[DescentPoint, float]:
-        """Return the point after a step with predicted tensions, and the decrease of the objective [J]."""
-        step, point = self._step, self._point
+    def _run_compiled_steps(self, compiled: CompiledNewton) -> DescentPoint:
+        """Return the point after steps with the exact Hessian, as long as they converge fast enough.
+
+        The current point is returned if there are none.
+        """
+        control, step, rule = self._control, self._step, self._rule
+        p, gradient, decreases = self._point.positions.copy(), self._point.gradient.copy(), self._decreases
+        progress = np.zeros(1, NEWTON_PROGRESS_DTYPE)
+        progress["steepest_slope"] = self._steepest
+        fixed = compiled.arrays, step.step_data, step.exact_pins
+        count, residual, _ = compiled.run_measured_steps.call(
+            *fixed, control.limits, self._max_decrement_ratio, p, gradient, decreases, progress
+        )
+        last = progress[0]
+        self._steepest = float(last["steepest_slope"])
+        failed = int(last["failed_supernode"])
+        self._method.factor.count_factorisations(int(last["num_factorisations"]), failed)
+        rule.is_indefinite = failed >= 0
+        if count == 0:
+            return self._point
+        rule.record_compiled_steps(progress, float(decreases[count - 1]))
+        point = DescentPoint(p, gradient)
+        for k in range(count):
+            self._record_step("newton", point, float(decreases[k]), 1.0)
+        control.num_iterations, control.residual = count, None if isnan(residual) else residual
+        return point
+
+    def _take_predicted_step(self) -> DescentPoint:
+        """Return the point after a step with predicted tensions."""
+        step, point, before = self._step, self._point, self._method.factor.num_factorisations
         if self._predicting is None:
             self._predicting = PredictedTensionNewton(self._method, step, self._origin())
             following, fall, is_past_saddle = self._predicting.compute_first_step(point)
             if is_past_saddle:
                 self._gains["lbfgs"] = np.inf
-            return following, fall
-        following, fall, self._is_trial_due = self._predicting.compute_next_step(point)
-        return following, fall
+        else:
+            following, fall, self._is_trial_due = self._predicting.compute_next_step(point)
+        self._record_step("predicted tensions", following, fall, self._method.factor.num_factorisations - before)
+        return following
 
     def _origin(self) -> DescentPoint:
         """Return the point at which the solve started."""

@@ -123,13 +123,10 @@ class PreparedExactNewton(PreparedDescent):
     @cached_property
     def compiled_method(self) -> CompiledMethod | None:
         """The compiled iterations, or None if they are not supported."""
-        search = self.metric.build_search_arrays(self.fixed_objective) if self.method.regularises_by_schedule else None
-        if search is None:
+        supported = self.method.regularises_by_schedule
+        arrays = build_newton_arrays(self.metric, self.fixed_objective) if supported else None
+        if arrays is None:
             return None
-        matrix, system = self.fixed_objective.hessian_matrix, self.metric.system
-        blocks = matrix.block_indices, matrix.constant_blocks, np.empty(0), matrix.values
-        scratch = np.empty((len(system.free_vertices), 3)), np.zeros((system.num_vertices, 3))
-        arrays = NewtonArrays(search, *blocks, matrix.factor.kernel_factor, *scratch)
         return CompiledMethod(TypedKernel(run_exact_steps), arrays, 0, NEWTON_PROGRESS_DTYPE)
 
     def init_state(self, problem: StepProblem, initial_guess: Positions) -> SolverState:
@@ -145,6 +142,22 @@ class PreparedExactNewton(PreparedDescent):
         return _CompiledNewtonState(
             self.compiled_method, self.method, factor, *self._build_step(problem, initial_guess)
         )
+
+
+def build_newton_arrays(metric: ResidualMetric, objective: FixedObjective) -> NewtonArrays | None:
+    """Build the arrays of compiled iterations, or return None if they are not supported.
+
+    Args:
+        metric: norm of residuals.
+        objective: objective of the system, whose Hessian's values and factor are overwritten in each iteration.
+    """
+    search = metric.build_search_arrays(objective)
+    if search is None:
+        return None
+    matrix, system = objective.hessian_matrix, metric.system
+    blocks = matrix.block_indices, matrix.constant_blocks, np.empty(0), matrix.values
+    scratch = np.empty((len(system.free_vertices), 3)), np.zeros((system.num_vertices, 3))
+    return NewtonArrays(search, *blocks, matrix.factor.kernel_factor, *scratch)
 
 
 class _CompiledNewtonState(CompiledDescentState):

@@ -18,8 +18,13 @@ from springbench.solvers.kernels.descent_search import (
     move_to_trial,
     search_backtracking,
 )
-from springbench.solvers.kernels.iteration_loop import build_compiled_loop
-from springbench.solvers.kernels.objective_kernels import compute_inner_product
+from springbench.solvers.kernels.iteration_loop import (
+    REASON_ITERATIONS,
+    RESIDUAL_EACH,
+    build_compiled_loop,
+    check_residual,
+)
+from springbench.solvers.kernels.objective_kernels import change_objective, compute_inner_product
 from springbench.solvers.kernels.residual_norm import compute_residual_norm
 from springbench.solvers.kernels.spring_hessian import BlockIndices, assemble_hessian
 from springbench.solvers.linalg.cholesky.block_cholesky import KernelFactor
@@ -33,9 +38,16 @@ NEWTON_PROGRESS_DTYPE = np.dtype(
         ("steepest_slope", np.float64),  # of the solve [J], positive
         ("has_residual", np.int64),  # whether the residual at the current point is known
         ("residual", np.float64),  # [J^(1/2)]
+        ("slope", np.float64),  # of measured steps: along the last displacement [J], positive
+        ("agrees_with_model", np.int64),  # of measured steps: whether the decrease in the last one agreed
+        ("decrement_ratio", np.float64),  # g'H^-1 g after over before the last step that agreed
     ]
 )
 """The progress of a solve."""
+
+MODEL_RANGE = (0.3, 0.7)
+"""Range of the decrease, as a fraction of the slope, in which a step agrees with the quadratic model: half of it for a
+full step on a quadratic function, three quarters for half a step."""
 
 
 class NewtonArrays(NamedTuple):
@@ -65,10 +77,19 @@ class NewtonArrays(NamedTuple):
 @jit_inner
 def _take_exact_step(state):
     """Do a step; return whether the positions changed."""
+    arrays, _, _, p, gradient, progress = state
+    if progress[0].is_stalled == 1 or not _find_exact_step(state):
+        return False
+    move_to_trial(arrays.search, p, gradient)
+    progress[0].has_residual = 0
+    return True
+
+
+@jit_inner
+def _find_exact_step(state):
+    """Find the trial point of a step; return whether there is one."""
     arrays, step_data, exact_pins, p, gradient, progress = state
     now, direction = progress[0], arrays.direction
-    if now.is_stalled == 1:
-        return False
     now.failed_supernode = _factorise_and_solve(arrays, p, gradient)
     if now.failed_supernode >= 0:
         return False
@@ -80,15 +101,12 @@ def _take_exact_step(state):
     ):
         now.is_stalled = 1
         return False
-    move_to_trial(arrays.search, p, gradient)
-    now.has_residual = 0
     return True
 
 
 @jit_inner
 def _factorise_and_solve(arrays, p, gradient):
     """Write the direction -H^-1 g; return the supernode at which the factorisation failed, or -1."""
-    free, x, factor = arrays.block_indices.free_vertices, arrays.solution, arrays.factor
     assemble_hessian(
         arrays.search.objective_terms,
         arrays.block_indices,
@@ -98,11 +116,27 @@ def _factorise_and_solve(arrays, p, gradient):
         1.0,
         arrays.values,
     )
+    return solve_negative(arrays, arrays.values, gradient)
+
+
+@jit_inner
+def solve_negative(arrays, values, gradient):
+    """Write the direction -H^-1 g.
+
+    Args:
+        arrays: arrays of the system.
+        values: blocks of the Hessian (b, 3, 3) [N/m]; without any, the last factor is used.
+        gradient: gradient g (n, 3) [N].
+
+    Returns:
+        The supernode at which the factorisation failed, or -1.
+    """
+    free, x, factor = arrays.block_indices.free_vertices, arrays.solution, arrays.factor
     for k in range(len(free)):
         for c in range(3):
             x[k, c] = gradient[free[k], c]
     failed = run_stages(
-        factor.fronts, factor.schedule, arrays.values, factor.panels, x, factor.scratch, factor.thread_team, None
+        factor.fronts, factor.schedule, values, factor.panels, x, factor.scratch, factor.thread_team, None
     )
     if failed < 0:
         for k in range(len(free)):
@@ -143,3 +177,67 @@ def run_exact_steps(arrays, step_data, exact_pins, limits, p, gradient, progress
     """
     progress[0].num_factorisations, progress[0].failed_supernode = 0, -1
     return _iterate_loop((arrays, step_data, exact_pins, p, gradient, progress), limits)
+
+
+@jit_kernel
+def run_measured_steps(arrays, step_data, exact_pins, limits, max_ratio, p, gradient, decreases, progress):
+    """Run steps that are compared with the quadratic model, until one disagrees or converges too slowly.
+
+    A step agrees if the decrease is in `MODEL_RANGE`, relative to the slope. Its convergence is measured by the ratio
+    of the squared Newton decrements g'H^-1 g after and before it, both with the Hessian before it.
+
+    Args:
+        arrays: arrays of the system.
+        step_data: data of the step.
+        exact_pins: exactly pinned vertices and their targets.
+        limits: limits of the loop, in iterations.
+        max_ratio: largest ratio at which the steps continue.
+        p: positions (n, 3) [m], updated.
+        gradient: gradient there (n, 3) [N], updated.
+        decreases: output, decrease of the objective in each step [J]; its length limits their number.
+        progress: progress of the solve (1,), updated. If the Hessian had no factor, `failed_supernode` is not negative;
+            if no step was found, `is_stalled` is 1.
+
+    Returns:
+        Number of iterations, last residual [J^(1/2)] or NaN, and termination reason.
+    """
+    state, now = (arrays, step_data, exact_pins, p, gradient, progress), progress[0]
+    count, residual, ended = 0, np.nan, REASON_ITERATIONS
+    now.num_factorisations, now.failed_supernode, now.is_stalled = 0, -1, 0
+    now.agrees_with_model, now.decrement_ratio = 1, 0.0
+    while (
+        count < min(limits.max_iterations, len(decreases))
+        and ended == REASON_ITERATIONS
+        and now.agrees_with_model == 1
+        and now.decrement_ratio <= max_ratio
+    ):
+        if not _take_measured_step(state, decreases[count:]):
+            break
+        count += 1
+        if limits.residual_mode == RESIDUAL_EACH:
+            residual = compute_residual_norm(arrays.search.residual_norm, gradient)
+            ended = check_residual(residual, limits)
+    return count, residual, ended
+
+
+@jit_inner
+def _take_measured_step(state, decrease):
+    """Do a step, and compare it with the quadratic model; return whether the positions changed."""
+    arrays, step_data, _, p, gradient, progress = state
+    now, search, q = progress[0], arrays.search, arrays.search.trial_positions
+    now.agrees_with_model = 0
+    if not _find_exact_step(state):
+        return False
+    slope = 0.0
+    for v in range(len(p)):
+        for c in range(3):
+            slope += gradient[v, c] * (p[v, c] - q[v, c])
+    decrease[0] = max(0.0, -change_objective(search.objective_terms, search.quadratic_form, step_data, p, q))
+    move_to_trial(search, p, gradient)
+    now.slope = slope
+    if decrease[0] == 0.0 or MODEL_RANGE[0] * slope <= decrease[0] <= MODEL_RANGE[1] * slope:
+        now.agrees_with_model = 1
+        if slope > 0.0:
+            solve_negative(arrays, arrays.values[:0], gradient)
+            now.decrement_ratio = -compute_inner_product(gradient, arrays.direction) / slope
+    return True

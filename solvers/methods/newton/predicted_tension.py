@@ -8,7 +8,7 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,11 +18,15 @@ from springbench.solvers.iteration.descent_method import (
     backtracking_line_search,
     inner_product,
 )
+from springbench.solvers.jit.typed_kernel import TypedKernel
 from springbench.solvers.kernels.line_search_conditions import is_armijo_step
+from springbench.solvers.methods.local_global.accelerated_local_global import AcceleratedState
 from springbench.solvers.methods.newton.inertia_shift import MODEL_DECREASE_FRACTION, InertiaShift
 from springbench.solvers.methods.newton.negative_curvature import probe_negative_curvature
+from springbench.solvers.methods.newton.newton_kernel import NewtonArrays, run_measured_steps
+from springbench.solvers.methods.newton.predicted_tension_kernel import try_full_step
 from springbench.solvers.model.step_problem import Positions
-from springbench.solvers.objective.step_objective import Hessian, StepObjective
+from springbench.solvers.objective.step_objective import StepObjective
 
 _QUADRATIC_SLOPE_RATIO = 0.1
 """Near a minimum a Newton step leaves at most this fraction of the slope."""
@@ -32,24 +36,76 @@ _MAX_SHIFT = 10.0
 """Largest multiple of the inertia that is added; then the negative parts of the springs are dropped instead."""
 
 
+class CompiledNewton(NamedTuple):
+    """Kernels of steps of Newton's methods for one system.
+
+    Attributes:
+        arrays: arrays of the system.
+        run_measured_steps: `springbench.solvers.methods.newton.newton_kernel.run_measured_steps`.
+        try_full_step: `springbench.solvers.methods.newton.predicted_tension_kernel.try_full_step`.
+    """
+
+    arrays: NewtonArrays
+    run_measured_steps: TypedKernel
+    try_full_step: TypedKernel
+
+    @classmethod
+    def from_arrays(cls, arrays: NewtonArrays) -> CompiledNewton:
+        """Create the kernels for the arrays of a system."""
+        return cls(arrays, TypedKernel(run_measured_steps), TypedKernel(try_full_step))
+
+
 class RelaxationMethod(Protocol):
     """The data of the method for one system.
 
-    The diagonals are those of the inertia and of Q, (3f,) [N/m].
+    The diagonals are those of the inertia and of Q, (3f,) [N/m]. `compiled_newton` are the compiled steps; None if they
+    are not supported.
     """
 
     metric: ResidualMetric
     inertia_diagonal: NDArray[np.float64]
     system_diagonal: NDArray[np.float64]
 
-    def relax_point(self, step: StepObjective, p: Positions) -> DescentPoint:
-        """Return the point after local relaxation, which removes the second-order stretch of a step.
+    @property
+    def compiled_newton(self) -> CompiledNewton | None: ...
+
+    def start_lbfgs(self, step: StepObjective, p: Positions) -> AcceleratedState:
+        """Start L-BFGS at positions p (n, 3) [m].
 
         Args:
             step: objective of the step.
             p: positions at the end of a Newton step (n, 3) [m].
         """
         ...
+
+    def relax_point(self, run: AcceleratedState, step: StepObjective) -> DescentPoint:
+        """Return the point after local relaxation, which removes the second-order stretch of a step.
+
+        Args:
+            run: state of L-BFGS at the end of a Newton step.
+            step: objective of the step.
+        """
+        ...
+
+
+class FullStep(NamedTuple):
+    """A step along the direction of a Hessian.
+
+    Attributes:
+        direction: direction (n, 3) [m], valid until the next step is computed.
+        slope: derivative along it [J].
+        predicted: tensions linearised for it (m,) [N].
+        positions: positions at its end (n, 3) [m].
+        change: change of the objective [J].
+        gradient: gradient there (n, 3) [N]; None unless the decrease agrees with the quadratic model.
+    """
+
+    direction: Positions
+    slope: float
+    predicted: NDArray[np.float64]
+    positions: Positions
+    change: float
+    gradient: Positions | None
 
 
 class PredictedTensionNewton:
@@ -67,6 +123,7 @@ class PredictedTensionNewton:
         self._first_point: DescentPoint | None = origin
         self._predicted_tensions = np.zeros(len(step.fixed_objective.springs.stiffness))
         self._shift, self._slope = InertiaShift(np.inf, _MAX_SHIFT), -np.inf
+        self._relaxation: AcceleratedState | None = None
 
     def compute_first_step(self, at: DescentPoint) -> tuple[DescentPoint, float, bool]:
         """Do the first step, with the true tensions.
@@ -109,51 +166,72 @@ class PredictedTensionNewton:
         """
         step, at = self._step, self._first_point or point
         self._first_point = None
-        hessian = step.hessian(at.positions)
-        descent = self._shift.find_smallest(lambda shift: self._solve_shifted(hessian, at.gradient, shift))
-        if descent is None:
+        full = self._shift.find_smallest(lambda shift: self._try_full_step(at, shift))
+        if full is None:
             return point, 0.0, True
-        direction = -descent
-        slope, before = inner_product(at.gradient, direction), self._slope
+        slope, before = full.slope, self._slope
         self._slope = slope
         if not -slope > self._method.metric.energy_roundoff(at.positions):
             return point, 0.0, True
-        predicted = step.linearise_tensions(at.positions, direction)
-        length, following, is_sufficient = self._line_search(at, direction, slope)
+        length, following, is_sufficient = self._line_search(at, full)
         if following is None:
             return point, 0.0, True
         self._shift.can_reduce = is_sufficient or self._shift.value == np.inf
-        self._predicted_tensions += length * (predicted - self._predicted_tensions)
+        self._predicted_tensions += length * (full.predicted - self._predicted_tensions)
         gain = compute_objective_decrease(step, point, following)
         if gain == 0.0:
             return point, 0.0, at is point
         return following, gain, self._shift.value == 0.0 and is_sufficient and slope >= _QUADRATIC_SLOPE_RATIO * before
 
-    def _solve_shifted(self, hessian: Hessian, b: Positions, shift: float) -> Positions | None:
-        """Solve with a multiple of the inertia added.
+    def _try_full_step(self, at: DescentPoint, shift: float) -> FullStep | None:
+        """Return the full step with a multiple of the inertia added, None if there is no factor.
 
         An infinite multiple drops negative transverse parts instead.
         """
+        method, step = self._method, self._step
         keep, by = (1.0, shift) if shift < np.inf else (0.0, 0.0)
-        added = by * self._method.inertia_diagonal if by > 0.0 else 0.0
-        return hessian.factorise_and_solve(b, keep, added, self._predicted_tensions)
+        if (compiled := method.compiled_newton) is None:
+            added = by * method.inertia_diagonal if by > 0.0 else 0.0
+            descent = step.hessian(at.positions).factorise_and_solve(at.gradient, keep, added, self._predicted_tensions)
+            if descent is None:
+                return None
+            direction = -descent
+            slope, p = inner_product(at.gradient, direction), step.apply_exact_pins(at.positions + direction)
+            predicted = step.linearise_tensions(at.positions, direction)
+            change = step.objective_change(at.positions, p)[0]
+            gradient = step.gradient(p) if change <= MODEL_DECREASE_FRACTION * slope else None
+            return FullStep(direction, slope, predicted, p, change, gradient)
+        p, gradient = np.empty_like(at.positions), np.empty_like(at.positions)
+        predicted, fixed = np.empty_like(self._predicted_tensions), (compiled.arrays, step.step_data, step.exact_pins)
+        hessian, outputs = (self._predicted_tensions, keep, by), (predicted, p, gradient)
+        failed, slope, change = compiled.try_full_step.call(
+            *fixed, *hessian, MODEL_DECREASE_FRACTION, at.positions, at.gradient, *outputs
+        )
+        step.fixed_objective.hessian_matrix.factor.count_factorisations(int(failed < 0), failed)
+        if failed >= 0:
+            return None
+        is_sufficient = change <= MODEL_DECREASE_FRACTION * slope
+        return FullStep(compiled.arrays.direction, slope, predicted, p, change, gradient if is_sufficient else None)
 
-    def _line_search(
-        self, at: DescentPoint, direction: Positions, slope: float
-    ) -> tuple[float, DescentPoint | None, bool]:
+    def _line_search(self, at: DescentPoint, full: FullStep) -> tuple[float, DescentPoint | None, bool]:
         """Return the step size, the new point, and whether the decrease agrees with the model."""
-        step = self._step
-        p = step.apply_exact_pins(at.positions + direction)
-        if step.objective_change(at.positions, p)[0] <= MODEL_DECREASE_FRACTION * slope:
-            return 1.0, DescentPoint(p, step.gradient(p)), True
-        relaxed = self._method.relax_point(step, p)
-        if is_armijo_step(step.objective_change(at.positions, relaxed.positions)[0], 1.0, slope, 0.0):
+        step, direction = self._step, full.direction
+        if full.gradient is not None:
+            return 1.0, DescentPoint(full.positions, full.gradient), True
+        relaxed = self._relax_point(full.positions)
+        if is_armijo_step(step.objective_change(at.positions, relaxed.positions)[0], 1.0, full.slope, 0.0):
             return 1.0, relaxed, False
         found = backtracking_line_search(step, at, direction, uses_rounded_slope=True)
         if found is None:
             return 0.0, None, False
         length = inner_product(found.positions - at.positions, direction) / inner_product(direction, direction)
-        return length, self._method.relax_point(step, found.positions), False
+        return length, self._relax_point(found.positions), False
+
+    def _relax_point(self, p: Positions) -> DescentPoint:
+        """Return the point after local relaxation of positions p (n, 3) [m]."""
+        last, step = self._relaxation, self._step
+        run = self._relaxation = self._method.start_lbfgs(step, p) if last is None else last.restart_at(p)
+        return self._method.relax_point(run, step)
 
 
 def compute_objective_decrease(step: StepObjective, before: DescentPoint, after: DescentPoint) -> float:

@@ -274,6 +274,11 @@ class CompiledAccelerationState(CompiledState, AcceleratedState):
             self._add_energy_scales(self._step_arrays[-1])
         return self
 
+    def restart_at(self, p: Positions) -> Self:
+        """Start the solve of the same step again at positions p (n, 3) [m]; return the state."""
+        self._step_arrays = *self._step_arrays[:-1], as_kernel_array(p)
+        return self.start_at_guess()
+
     def _add_energy_scales(self, p: Positions) -> None:
         """Add the scales of cancellation in forms and edges at the start p (n, 3) [m]."""
         parts, values = self._engine.spring_form, self._state[0].objective_values
