@@ -16,6 +16,8 @@ prediction.
 A round ends with a check, which costs c iterations. Rounds of s iterations cost c/s per iteration, and the last one
 makes s/2 iterations superfluous. With n iterations, n c/s + s/2 is minimal for s = sqrt(2 c n). Rounds have twice that
 length: this costs a quarter more than the minimum, and halves the number of rounds, which limits of iterations count.
+If a check costs less than an iteration, a round also has at most one iteration more than a sixteenth of those before
+it, so that a solve of few iterations does not end much later than it could.
 """
 
 from __future__ import annotations
@@ -43,12 +45,19 @@ GROUP_ITERATIONS = 10
 PROBE_ITERATIONS = 4
 """Iterations before the suitability of the method is assessed."""
 
+_MAX_ROUND_FRACTION = 1.0 / 16.0
+"""Length of a round in addition to one iteration, as a fraction of the iterations before it; for checks that cost less
+than an iteration."""
+
 _FAST_RESIDUAL_RATIO = 0.5
 """Largest ratio of residuals after the very first iterations at which the method is considered suitable."""
 
 _NEAR_FRACTION = 5e-5
 """Largest decrease per iteration, as a fraction of that since the start, at which sweeps may follow L-BFGS: far from a
 minimum they lead to other, higher minima more often."""
+
+_NEAR_ITERATIONS = 4
+"""Smallest number of iterations over which that decrease is averaged."""
 
 _SWEEP_RESIDUAL_RATIO = 10.0**-0.25
 """Largest ratio of residuals at which more sweeps follow: that of a tenth of the objective in two rounds."""
@@ -74,7 +83,8 @@ ROUND_STATE_DTYPE = np.dtype(
         ("is_sweeping", np.int64),  # whether the next round consists of sweeps
         ("segment_end", np.int64),  # iterations after which sweeps may follow
         ("segment_residual", np.float64),  # residual at the last choice [J^(1/2)]; 0: not known
-        ("round_decrease", np.float64),  # decrease of the objective before the round [J]
+        ("late_start", np.int64),  # iterations from which the decrease per iteration is averaged
+        ("late_decrease", np.float64),  # decrease of the objective there [J]
         ("residual_floor", np.float64),  # residual that rounded positions leave [J^(1/2)]
     ]
 )
@@ -87,16 +97,20 @@ def round_size(now):
     left = (PROBE_ITERATIONS if now.num_iterations < PROBE_ITERATIONS else now.group_end) - now.num_iterations
     if now.sweep_cost > 0:
         left = min(left, now.segment_end - now.num_iterations)
-    return max(1, min(left, int(0.5 + 2.0 * np.sqrt(2.0 * now.check_cost * now.num_iterations))))
+    size = int(0.5 + 2.0 * np.sqrt(2.0 * now.check_cost * now.num_iterations))
+    if now.check_cost < 1.0:
+        size = min(size, 1 + int(_MAX_ROUND_FRACTION * now.num_iterations))
+    return max(1, min(left, size))
 
 
 @register_jitable(**jit_inner_options)
-def _choose_sweeps(now, decrease, residual, size):
-    """Decide whether the next round consists of sweeps, after one of `size` iterations."""
+def _choose_sweeps(now, decrease, residual):
+    """Decide whether the next round consists of sweeps."""
     if now.is_sweeping == 1:
         continues = residual < _SWEEP_RESIDUAL_RATIO * now.segment_residual
     else:
-        continues = decrease - now.round_decrease <= _NEAR_FRACTION * size * decrease
+        count = now.num_iterations - now.late_start
+        continues = decrease - now.late_decrease <= _NEAR_FRACTION * count * decrease
     now.is_sweeping = 1 if continues else 0
     now.segment_end, now.segment_residual = now.num_iterations + GROUP_ITERATIONS, residual
 
@@ -176,8 +190,9 @@ def build_rounds(
                 found = residual(state, exact_below)
                 ended = check_residual(found, limits)
             if ends_segment:
-                _choose_sweeps(now, total, found, size)
-            now.round_decrease = total
+                _choose_sweeps(now, total, found)
+            if ends_segment or now.num_iterations <= now.segment_end - _NEAR_ITERATIONS:
+                now.late_start, now.late_decrease = now.num_iterations, total
             if ended == REASON_ITERATIONS:
                 ended = _assess_round(now, total, found, limits.residual_limit) if is_done else REASON_STALLED
         return count, found, ended

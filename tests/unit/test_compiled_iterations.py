@@ -1,4 +1,7 @@
-"""Compiled iterations of A-Jacobi, nonlinear conjugate gradients and Newton's methods, and their interpreted loops."""
+"""Compiled iterations of A-Jacobi, nonlinear conjugate gradients and Newton's methods, and their interpreted loops.
+
+The steps of Newton's methods in `hybrid`, too.
+"""
 
 from __future__ import annotations
 
@@ -8,15 +11,37 @@ from itertools import islice
 import numpy as np
 import pytest
 from springbench.solvers.methods.local_global.aggregated_jacobi import AggregatedJacobi
+from springbench.solvers.methods.newton.hybrid_newton import HybridNewton, PreparedHybrid
 from springbench.solvers.methods.newton.newton_cg import NewtonCG
 from springbench.solvers.methods.newton.newton_direct import NewtonSolver
 from springbench.solvers.methods.quasi_newton.nonlinear_cg import NonlinearCG
-from springbench.solvers.model.step_problem import StopRule
+from springbench.solvers.model.step_problem import StepProblem, StopRule
 
 from tests.effect_scenes import EFFECT_SCENES, build_moving_problem
 from tests.scene_builders import build_cloth, build_first_problem
 
 HANGING = build_first_problem(build_cloth(8, "exact", stretch=100.0))
+
+
+def lighten(problem: StepProblem) -> StepProblem:
+    """A step of a scene with 1e-5 of the mass and of the forces, so that its springs are stiff."""
+    system = replace(problem.system, mass=1e-5 * problem.system.mass)
+    return replace(problem, system=system, external_force=1e-5 * problem.external_force)
+
+
+def squeeze(problem: StepProblem) -> StepProblem:
+    """A step that begins with the edges moved together by a tenth: its Hessian is indefinite."""
+    squeezed = problem.current_positions * [0.9, 1.0, 1.0]
+    return replace(problem, initial_guess=squeezed, inertial_target=squeezed)
+
+
+STIFF_STEPS = {
+    "exact pins": lighten(HANGING),
+    "penalty pins": lighten(build_first_problem(build_cloth(8, stretch=100.0))),
+    "squeezed": squeeze(lighten(HANGING)),
+    "bending": lighten(build_moving_problem(EFFECT_SCENES["bending"]())),
+    "attachments": lighten(build_moving_problem(EFFECT_SCENES["attachments"]())),
+}
 
 
 @pytest.mark.parametrize(
@@ -37,6 +62,28 @@ def test_compiled_iterations_are_the_interpreted_ones(method, compiled_part, sce
         found, wanted = compiled.solve(problem, stop), interpreted.solve(problem, stop)
         assert found.num_iterations == wanted.num_iterations
         np.testing.assert_allclose(found.positions, wanted.positions, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("scene", STIFF_STEPS)
+def test_compiled_newton_steps_of_the_hybrid_are_the_interpreted_ones(scene):
+    problem, stop = STIFF_STEPS[scene], StopRule(300, 1e-8)
+    compiled, interpreted = (HybridNewton().prepare(problem.system) for _ in range(2))
+    assert isinstance(compiled, PreparedHybrid)
+    assert isinstance(interpreted, PreparedHybrid)
+    assert compiled.method.compiled_newton is not None
+    vars(interpreted.method)["_compiled_newton"] = None
+    found, wanted = compiled.solve(problem, stop), interpreted.solve(problem, stop)
+    phases, expected = found.solver_phases, wanted.solver_phases
+    assert phases is not None
+    assert expected is not None
+    assert phases.keys() - {"lbfgs"}
+    assert {name: phase[0] for name, phase in phases.items()} == {name: phase[0] for name, phase in expected.items()}
+    for name, phase in phases.items():
+        assert phase[1] == pytest.approx(expected[name][1], rel=1e-12)  # counted from other intermediate sums
+    assert found.num_iterations == wanted.num_iterations
+    assert found.termination_reason == wanted.termination_reason
+    assert found.residual == pytest.approx(wanted.residual, rel=1e-12)
+    np.testing.assert_array_equal(found.positions, wanted.positions)
 
 
 @pytest.mark.parametrize(

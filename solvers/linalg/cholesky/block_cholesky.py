@@ -38,10 +38,14 @@ _MIN_FACTORISATION = 0.2
 
 
 class KernelFactor(NamedTuple):
-    """Arguments of `run_stages` for factorisations in one thread, without the matrix and the right-hand side."""
+    """Arguments of `run_stages` in one thread, without the matrix and the right-hand side.
+
+    `schedule` factorises, and solves if there is a right-hand side; `solve_schedule` solves with the last factor.
+    """
 
     fronts: FrontalStructure
     schedule: FactorisationSchedule
+    solve_schedule: FactorisationSchedule
     panels: NDArray[np.float64]
     scratch: FactorisationScratch
     thread_team: ThreadTeam
@@ -160,8 +164,8 @@ class BlockCholesky:
     @property
     def kernel_factor(self) -> KernelFactor:
         """The factor for kernels, which call `run_stages` in one thread."""
-        schedule, _, scratch, team, *_ = self._workspaces[1]
-        return KernelFactor(self.fronts, schedule, self.panels, scratch, team)
+        schedule, solve_schedule, scratch, team, *_ = self._workspaces[1]
+        return KernelFactor(self.fronts, schedule, solve_schedule, self.panels, scratch, team)
 
     def count_factorisations(self, num_complete: int, failed_supernode: int) -> None:
         """Add factorisations to the count.

@@ -136,10 +136,13 @@ _MAX_SHIFT = 1e3
 NO_GRADIENT = np.empty((0, 3))
 """Placeholder for the gradient at a point of L-BFGS: the residual there is known, and the gradient is not used."""
 
-_LBFGS_NANOSECONDS, _SWEEP_NANOSECONDS, _NEWTON_NANOSECONDS = (7e2, 26.0, 1.2), (6e2, 10.0), (4e4, 0.023, 5.4)
+_LBFGS_NANOSECONDS, _SWEEP_NANOSECONDS, _NEWTON_NANOSECONDS = (7e2, 26.0, 1.2), (6e2, 10.0), (5e3, 0.023, 5.4)
 """Costs of an L-BFGS iteration (constant, per vertex, per entry of the factor), of a sweep (constant, per spring) and
-of a Newton step (constant, per flop, per entry), fitted to 31 scenes of 6 to 16384 vertices on one core with AVX-512;
-their ratio alone matters."""
+of a compiled Newton step (constant, per flop, per entry), fitted to 31 scenes of 6 to 16384 vertices on one core with
+AVX-512; their ratio alone matters."""
+
+_INTERPRETED_NANOSECONDS = 4e4
+"""Constant cost of a Newton step that is not compiled."""
 
 _MAX_EXACT_RATIO = _MAX_SWEEP_RATIO = float(np.finfo(np.float64).eps) ** -0.5
 """Largest ratio of the diagonal of Q to the inertia at which the gradients of L-BFGS are used, and at which there are
@@ -487,7 +490,8 @@ class MeasuredRule(ShiftScheduleRule):
         agrees_with_model: whether the Hessian of the last step was unmodified and its decrease agreed with the model.
         decrement_ratio: ratio of the squared Newton decrements g'H^-1 g after and before a step that agreed.
         is_exact_only: whether only the unmodified Hessian may be factorised.
-        is_indefinite: whether the exact Hessian at the next point is known to have no factor.
+        has_factor: whether the exact Hessian at the next point has a factor, which is then the last one; None if that
+            is not known.
         decrease: decrease of the objective in the last step [J]; None before it, and if there was none.
     """
 
@@ -502,8 +506,8 @@ class MeasuredRule(ShiftScheduleRule):
         self._shift, self._level, self._before = InertiaShift(0.0, _MAX_SHIFT), cast(int | None, None), 0.0
         self._gains = {"shift": np.inf, "schedule": np.inf}  # [J] per factorisation, when last used
         self._name = "shift"
-        self.agrees_with_model = self.is_exact_only = self.is_indefinite = False
-        self.decrement_ratio, self.decrease = 0.0, cast(float | None, None)
+        self.agrees_with_model = self.is_exact_only = False
+        self.has_factor, self.decrement_ratio, self.decrease = cast(bool | None, None), 0.0, cast(float | None, None)
 
     def factorise_hessian(self, hessian: Hessian, at: DescentPoint, diagonal: NDArray[np.float64]) -> int | None:
         """Factorise the exact Hessian or, unless `is_exact_only`, a shifted one.
@@ -518,13 +522,15 @@ class MeasuredRule(ShiftScheduleRule):
         """
         self.agrees_with_model, self.decrease, self._before = False, None, self._factor.num_factorisations
         self._name = max(self._gains, key=lambda name: self._gains[name])
-        if self.is_exact_only:
-            self._level = None if self.is_indefinite or not hessian.factorise() else 0
+        if self.has_factor:
+            self._level = 0
+        elif self.is_exact_only:
+            self._level = 0 if self.has_factor is None and hessian.factorise() else None
         elif self._name == "schedule":
-            self._level = factorise_shifted(hessian, diagonal, first_level=int(self.is_indefinite))
+            self._level = factorise_shifted(hessian, diagonal, first_level=int(self.has_factor is False))
         else:
             self._level = self._shift.find_smallest(lambda shift: self._factorise_shifted(hessian, diagonal, shift))
-        self.is_indefinite = False
+        self.has_factor = None
         return self._level
 
     @property
@@ -539,7 +545,7 @@ class MeasuredRule(ShiftScheduleRule):
         """
         if shift == np.inf:
             return factorise_shifted(hessian, diagonal, first_level=1)
-        if shift == 0.0 and self.is_indefinite:
+        if shift == 0.0 and self.has_factor is False:
             return None
         added = shift * self._inertia_diagonal if shift > 0.0 else 0.0
         return int(shift > 0.0) if hessian.factorise(1.0, added) else None
@@ -623,6 +629,7 @@ class HybridIteration:
         constant, per_vertex, per_entry = _LBFGS_NANOSECONDS
         lbfgs_cost = constant + per_vertex * objective.system.num_vertices + per_entry * entries
         constant, per_flop, per_entry = _NEWTON_NANOSECONDS
+        constant = constant if objective.is_springs_and_forms else _INTERPRETED_NANOSECONDS
         newton_cost = constant + per_flop * factor.flops + per_entry * factor.nonzeros
         self.newton_cost = newton_cost / (GROUP_ITERATIONS * lbfgs_cost)
         constant, per_spring = _SWEEP_NANOSECONDS
@@ -860,13 +867,10 @@ class MethodChoice:
 
         Errors are compared per cost. The error is the squared Newton decrement, and for L-BFGS the decrease of a group.
         """
-        if not self._agrees_with_model:
-            return False
-        return self._rule.decrement_ratio <= self._max_decrement_ratio
+        return self._agrees_with_model and self._rule.decrement_ratio <= self._compute_max_decrement_ratio()
 
-    @property
-    def _max_decrement_ratio(self) -> float:
-        """Ratio of squared decrements up to which Newton's method converges faster than L-BFGS did."""
+    def _compute_max_decrement_ratio(self) -> float:
+        """Return the ratio of squared decrements up to which Newton's method converges faster than L-BFGS did."""
         other = float(self._rounds["gain_ratio"][0])
         return other**self._method.newton_cost if 0.0 < other < 1.0 else np.inf
 
@@ -885,7 +889,7 @@ class MethodChoice:
             rounds["group_start"], rounds["group_end"] = 0.0, rounds["num_iterations"] + GROUP_ITERATIONS
             rounds["gain"], rounds["gain_ratio"], rounds["group_residual"] = np.inf, 1.0, 0.0
             rounds["segment_end"], rounds["is_sweeping"] = rounds["group_end"], 0
-            rounds["round_decrease"] = 0.0
+            rounds["late_start"], rounds["late_decrease"] = rounds["num_iterations"], 0.0
         if step.barrier_energies:  # each round is checked for collisions
             limits = limits._replace(max_iterations=1)
         rival_gain = max(self._gains["predicted tensions"], self._gains["newton"])
@@ -953,7 +957,7 @@ class MethodChoice:
     def _run_compiled_steps(self, compiled: CompiledNewton) -> DescentPoint:
         """Return the point after steps with the exact Hessian, as long as they converge fast enough.
 
-        The current point is returned if there are none.
+        The current point is returned if there are none; its Hessian, if it has a factor, is then factorised.
         """
         control, step, rule = self._control, self._step, self._rule
         p, gradient, decreases = self._point.positions.copy(), self._point.gradient.copy(), self._decreases
@@ -961,14 +965,14 @@ class MethodChoice:
         progress["steepest_slope"] = self._steepest
         fixed = compiled.arrays, step.step_data, step.exact_pins
         count, residual, _ = compiled.run_measured_steps.call(
-            *fixed, control.limits, self._max_decrement_ratio, p, gradient, decreases, progress
+            *fixed, control.limits, self._compute_max_decrement_ratio(), p, gradient, decreases, progress
         )
         last = progress[0]
         self._steepest = float(last["steepest_slope"])
         failed = int(last["failed_supernode"])
         self._method.factor.count_factorisations(int(last["num_factorisations"]), failed)
-        rule.is_indefinite = failed >= 0
         if count == 0:
+            rule.has_factor = failed < 0
             return self._point
         rule.record_compiled_steps(progress, float(decreases[count - 1]))
         point = DescentPoint(p, gradient)

@@ -116,16 +116,16 @@ def _factorise_and_solve(arrays, p, gradient):
         1.0,
         arrays.values,
     )
-    return solve_negative(arrays, arrays.values, gradient)
+    return solve_negative(arrays, arrays.factor.schedule, gradient)
 
 
 @jit_inner
-def solve_negative(arrays, values, gradient):
+def solve_negative(arrays, schedule, gradient):
     """Write the direction -H^-1 g.
 
     Args:
-        arrays: arrays of the system.
-        values: blocks of the Hessian (b, 3, 3) [N/m]; without any, the last factor is used.
+        arrays: arrays of the system, with the blocks of the Hessian.
+        schedule: schedule of the factor, to factorise the Hessian first or to solve with the last factor.
         gradient: gradient g (n, 3) [N].
 
     Returns:
@@ -136,7 +136,7 @@ def solve_negative(arrays, values, gradient):
         for c in range(3):
             x[k, c] = gradient[free[k], c]
     failed = run_stages(
-        factor.fronts, factor.schedule, values, factor.panels, x, factor.scratch, factor.thread_team, None
+        factor.fronts, schedule, arrays.values, factor.panels, x, factor.scratch, factor.thread_team, None
     )
     if failed < 0:
         for k in range(len(free)):
@@ -238,6 +238,6 @@ def _take_measured_step(state, decrease):
     if decrease[0] == 0.0 or MODEL_RANGE[0] * slope <= decrease[0] <= MODEL_RANGE[1] * slope:
         now.agrees_with_model = 1
         if slope > 0.0:
-            solve_negative(arrays, arrays.values[:0], gradient)
+            solve_negative(arrays, arrays.factor.solve_schedule, gradient)
             now.decrement_ratio = -compute_inner_product(gradient, arrays.direction) / slope
     return True

@@ -45,7 +45,7 @@ def try_full_step(
         for v in places.free_vertices:
             for c in range(3):
                 arrays.values[places.diagonal_block[v], c, c] += shift * terms.inertia_diagonal[v]
-    failed = solve_negative(arrays, arrays.values, gradient)
+    failed = solve_negative(arrays, arrays.factor.schedule, gradient)
     if failed >= 0:
         return failed, 0.0, 0.0
     slope = compute_inner_product(gradient, arrays.direction)
