@@ -57,7 +57,10 @@ class AcceleratedState(SolverState):
 
     @abstractmethod
     def restart_at(self, p: Positions) -> Self:
-        """Return a state of the same step that starts at positions p (n, 3) [m]; this one must not be used again."""
+        """Return a state of the same step that starts at positions p (n, 3) [m].
+
+        This state must not be used again.
+        """
 
     def run_rounds(self, rounds: NDArray[Any], limits: LoopLimits) -> tuple[int, float, int]:
         """Run rounds of iterations.

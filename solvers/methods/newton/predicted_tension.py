@@ -184,9 +184,9 @@ class PredictedTensionNewton:
         return following, gain, self._shift.value == 0.0 and is_sufficient and slope >= _QUADRATIC_SLOPE_RATIO * before
 
     def _try_full_step(self, at: DescentPoint, shift: float) -> FullStep | None:
-        """Return the full step with a multiple of the inertia added, None if there is no factor.
+        """Return the full step with a multiple of the inertia added.
 
-        An infinite multiple drops negative transverse parts instead.
+        It is None if there is no factor. An infinite multiple drops negative transverse parts instead.
         """
         method, step = self._method, self._step
         keep, by = (1.0, shift) if shift < np.inf else (0.0, 0.0)
