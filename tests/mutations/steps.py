@@ -116,6 +116,20 @@ _TABLE = (
         f"{_U}/test_newton.py",
     ),
     (
+        "compiled-newton-convergence",
+        "solvers/methods/newton/newton_kernel.py",
+        "        and now.decrement_ratio <= max_ratio\n",
+        "",
+        f"{_U}/test_compiled_iterations.py",
+    ),
+    (
+        "compiled-tension-shift",
+        "solvers/methods/newton/predicted_tension_kernel.py",
+        "shift * terms.inertia_diagonal[v]",
+        "0.5 * shift * terms.inertia_diagonal[v]",
+        f"{_U}/test_compiled_iterations.py",
+    ),
+    (
         "compiled-newton-cg-tolerance",
         "solvers/methods/newton/newton_cg_kernel.py",
         "max(MIN_ETA, 0.9 * square / square_before,",

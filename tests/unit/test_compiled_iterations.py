@@ -10,12 +10,15 @@ from itertools import islice
 
 import numpy as np
 import pytest
+from springbench.solvers.kernels.iteration_loop import RESIDUAL_NEVER, LoopLimits
 from springbench.solvers.methods.local_global.aggregated_jacobi import AggregatedJacobi
 from springbench.solvers.methods.newton.hybrid_newton import HybridNewton, PreparedHybrid
 from springbench.solvers.methods.newton.newton_cg import NewtonCG
 from springbench.solvers.methods.newton.newton_direct import NewtonSolver
+from springbench.solvers.methods.newton.newton_kernel import NEWTON_PROGRESS_DTYPE
 from springbench.solvers.methods.quasi_newton.nonlinear_cg import NonlinearCG
 from springbench.solvers.model.step_problem import StepProblem, StopRule
+from springbench.solvers.objective.step_objective import StepObjective
 
 from tests.effect_scenes import EFFECT_SCENES, build_moving_problem
 from tests.scene_builders import build_cloth, build_first_problem
@@ -97,3 +100,20 @@ def test_solves_at_the_same_time_have_separate_work_arrays(method):
         np.testing.assert_array_equal(next(one), wanted)
         np.testing.assert_array_equal(next(other), wanted)
         prepared.solve(HANGING, StopRule(3))
+
+
+@pytest.mark.parametrize(("max_ratio", "num_steps"), [(0.0, 1), (np.inf, 2)])
+def test_measured_steps_end_where_they_converge_too_slowly(max_ratio, num_steps):
+    problem = STIFF_STEPS["exact pins"]
+    prepared = HybridNewton().prepare(problem.system)
+    assert isinstance(prepared, PreparedHybrid)
+    compiled, step = prepared.method.compiled_newton, StepObjective(prepared.fixed_objective, problem)
+    assert compiled is not None
+    p = NewtonSolver().prepare(problem.system).solve(problem, StopRule(300, 1e-2)).positions
+    p, gradient, decreases, progress = p.copy(), step.gradient(p), np.empty(8), np.zeros(1, NEWTON_PROGRESS_DTYPE)
+    fixed, limits = (compiled.arrays, step.step_data, step.exact_pins), LoopLimits(2, 0.0, 0.0, RESIDUAL_NEVER)
+    count, _, _ = compiled.run_measured_steps.kernel(*fixed, limits, max_ratio, p, gradient, decreases, progress)
+    assert count == num_steps
+    assert progress["agrees_with_model"] == 1
+    assert 0.0 < progress["decrement_ratio"] < 0.1
+    np.testing.assert_array_equal(gradient, step.gradient(p))

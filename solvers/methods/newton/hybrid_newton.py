@@ -870,7 +870,10 @@ class MethodChoice:
         return self._agrees_with_model and self._rule.decrement_ratio <= self._compute_max_decrement_ratio()
 
     def _compute_max_decrement_ratio(self) -> float:
-        """Return the ratio of squared decrements up to which Newton's method converges faster than L-BFGS did."""
+        """Return the largest ratio of decrements at which Newton's method continues.
+
+        Up to this ratio, it converges faster than L-BFGS did.
+        """
         other = float(self._rounds["gain_ratio"][0])
         return other**self._method.newton_cost if 0.0 < other < 1.0 else np.inf
 
@@ -929,10 +932,9 @@ class MethodChoice:
     def _take_exact_steps(self) -> DescentPoint:
         """Return the point after steps of the exact method.
 
-        They are compiled if they are supported, and as long as the exact Hessian has a factor.
-
-        If it has none, the current point is returned. Predicted tensions follow from the second time on, or if L-BFGS
-        has ended. The first time, L-BFGS has often not yet reached a convex region, and the next attempt comes sooner.
+        They are compiled if they are supported, and as long as the exact Hessian has a factor. If it has none, the
+        current point is returned. Predicted tensions follow from the second time on, or if L-BFGS has ended. The first
+        time, L-BFGS has often not yet reached a convex region, and the next attempt comes sooner.
         """
         method, rule, before = self._method, self._rule, self._method.factor.num_factorisations
         rule.is_exact_only = self._predicting is None and any(self._gains.values())
@@ -955,7 +957,7 @@ class MethodChoice:
         return point
 
     def _run_compiled_steps(self, compiled: CompiledNewton) -> DescentPoint:
-        """Return the point after steps with the exact Hessian, as long as they converge fast enough.
+        """Return the point after steps with the exact Hessian that converge fast enough.
 
         The current point is returned if there are none; its Hessian, if it has a factor, is then factorised.
         """

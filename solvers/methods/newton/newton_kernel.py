@@ -181,7 +181,7 @@ def run_exact_steps(arrays, step_data, exact_pins, limits, p, gradient, progress
 
 @jit_kernel
 def run_measured_steps(arrays, step_data, exact_pins, limits, max_ratio, p, gradient, decreases, progress):
-    """Run steps that are compared with the quadratic model, until one disagrees or converges too slowly.
+    """Run steps as long as they agree with the quadratic model and converge fast enough.
 
     A step agrees if the decrease is in `MODEL_RANGE`, relative to the slope. Its convergence is measured by the ratio
     of the squared Newton decrements g'H^-1 g after and before it, both with the Hessian before it.
@@ -225,7 +225,6 @@ def _take_measured_step(state, decrease):
     """Do a step, and compare it with the quadratic model; return whether the positions changed."""
     arrays, step_data, _, p, gradient, progress = state
     now, search, q = progress[0], arrays.search, arrays.search.trial_positions
-    now.agrees_with_model = 0
     if not _find_exact_step(state):
         return False
     slope = 0.0
@@ -234,7 +233,7 @@ def _take_measured_step(state, decrease):
             slope += gradient[v, c] * (p[v, c] - q[v, c])
     decrease[0] = max(0.0, -change_objective(search.objective_terms, search.quadratic_form, step_data, p, q))
     move_to_trial(search, p, gradient)
-    now.slope = slope
+    now.slope, now.agrees_with_model = slope, 0
     if decrease[0] == 0.0 or MODEL_RANGE[0] * slope <= decrease[0] <= MODEL_RANGE[1] * slope:
         now.agrees_with_model = 1
         if slope > 0.0:
