@@ -136,13 +136,10 @@ _MAX_SHIFT = 1e3
 NO_GRADIENT = np.empty((0, 3))
 """Placeholder for the gradient at a point of L-BFGS: the residual there is known, and the gradient is not used."""
 
-_LBFGS_NANOSECONDS, _SWEEP_NANOSECONDS, _NEWTON_NANOSECONDS = (7e2, 26.0, 1.2), (6e2, 10.0), (5e3, 0.023, 5.4)
+_LBFGS_NANOSECONDS, _SWEEP_NANOSECONDS, _NEWTON_NANOSECONDS = (7e2, 26.0, 1.2), (6e2, 10.0), (4e4, 0.023, 5.4)
 """Costs of an L-BFGS iteration (constant, per vertex, per entry of the factor), of a sweep (constant, per spring) and
-of a compiled Newton step (constant, per flop, per entry), fitted to 31 scenes of 6 to 16384 vertices on one core with
-AVX-512; their ratio alone matters."""
-
-_INTERPRETED_NANOSECONDS = 4e4
-"""Constant cost of a Newton step that is not compiled."""
+of a Newton step (constant, per flop, per entry), fitted to 31 scenes of 6 to 16384 vertices on one core with AVX-512;
+their ratio alone matters."""
 
 _MAX_EXACT_RATIO = _MAX_SWEEP_RATIO = float(np.finfo(np.float64).eps) ** -0.5
 """Largest ratio of the diagonal of Q to the inertia at which the gradients of L-BFGS are used, and at which there are
@@ -629,7 +626,6 @@ class HybridIteration:
         constant, per_vertex, per_entry = _LBFGS_NANOSECONDS
         lbfgs_cost = constant + per_vertex * objective.system.num_vertices + per_entry * entries
         constant, per_flop, per_entry = _NEWTON_NANOSECONDS
-        constant = constant if objective.is_springs_and_forms else _INTERPRETED_NANOSECONDS
         newton_cost = constant + per_flop * factor.flops + per_entry * factor.nonzeros
         self.newton_cost = newton_cost / (GROUP_ITERATIONS * lbfgs_cost)
         constant, per_spring = _SWEEP_NANOSECONDS
