@@ -27,9 +27,9 @@ HANGING = build_first_problem(build_cloth(8, "exact", stretch=100.0))
 
 
 def lighten(problem: StepProblem) -> StepProblem:
-    """A step of a scene with 1e-5 of the mass and of the forces, so that its springs are stiff."""
-    system = replace(problem.system, mass=1e-5 * problem.system.mass)
-    return replace(problem, system=system, external_force=1e-5 * problem.external_force)
+    """A step of a scene with 1e-6 of the mass and of the forces, so that its springs are stiff."""
+    system = replace(problem.system, mass=1e-6 * problem.system.mass)
+    return replace(problem, system=system, external_force=1e-6 * problem.external_force)
 
 
 def squeeze(problem: StepProblem) -> StepProblem:
