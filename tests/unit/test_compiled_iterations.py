@@ -26,10 +26,10 @@ from tests.scene_builders import build_cloth, build_first_problem
 HANGING = build_first_problem(build_cloth(8, "exact", stretch=100.0))
 
 
-def lighten(problem: StepProblem) -> StepProblem:
-    """A step of a scene with 1e-6 of the mass and of the forces, so that its springs are stiff."""
-    system = replace(problem.system, mass=1e-6 * problem.system.mass)
-    return replace(problem, system=system, external_force=1e-6 * problem.external_force)
+def lighten(problem: StepProblem, fraction: float = 1e-5) -> StepProblem:
+    """A step of a scene with a fraction of the mass and of the forces, so that its springs are stiff."""
+    system = replace(problem.system, mass=fraction * problem.system.mass)
+    return replace(problem, system=system, external_force=fraction * problem.external_force)
 
 
 def squeeze(problem: StepProblem) -> StepProblem:
@@ -42,7 +42,7 @@ STIFF_STEPS = {
     "exact pins": lighten(HANGING),
     "penalty pins": lighten(build_first_problem(build_cloth(8, stretch=100.0))),
     "squeezed": squeeze(lighten(HANGING)),
-    "bending": lighten(build_moving_problem(EFFECT_SCENES["bending"]())),
+    "bending": lighten(build_moving_problem(EFFECT_SCENES["bending"]()), 1e-6),
     "attachments": lighten(build_moving_problem(EFFECT_SCENES["attachments"]())),
 }
 
