@@ -16,8 +16,9 @@ prediction.
 A round ends with a check, which costs c iterations. Rounds of s iterations cost c/s per iteration, and the last one
 makes s/2 iterations superfluous. With n iterations, n c/s + s/2 is minimal for s = sqrt(2 c n). Rounds have twice that
 length: this costs a quarter more than the minimum, and halves the number of rounds, which limits of iterations count.
-If a check costs less than an iteration, a round also has at most one iteration more than an eighth of those before
-it, so that a solve of few iterations does not end much later than it could.
+If there are sweeps and a check costs less than an iteration, a round also has at most one iteration more than an eighth
+of those before it, so that a solve of few iterations does not end much later than it could. There are no sweeps where
+springs are so stiff that residuals near the tolerance are round-off, which more checks would meet more often.
 """
 
 from __future__ import annotations
@@ -95,11 +96,11 @@ ROUND_STATE_DTYPE = np.dtype(
 def round_size(now):
     """Return the number of iterations of the next round, up to the next decision."""
     left = (PROBE_ITERATIONS if now.num_iterations < PROBE_ITERATIONS else now.group_end) - now.num_iterations
+    size = int(0.5 + 2.0 * np.sqrt(2.0 * now.check_cost * now.num_iterations))
     if now.sweep_cost > 0:
         left = min(left, now.segment_end - now.num_iterations)
-    size = int(0.5 + 2.0 * np.sqrt(2.0 * now.check_cost * now.num_iterations))
-    if now.check_cost < 1.0:
-        size = min(size, 1 + int(_MAX_ROUND_FRACTION * now.num_iterations))
+        if now.check_cost < 1.0:
+            size = min(size, 1 + int(_MAX_ROUND_FRACTION * now.num_iterations))
     return max(1, min(left, size))
 
 

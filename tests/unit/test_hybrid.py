@@ -270,7 +270,7 @@ def test_a_round_costs_a_quarter_more_than_the_least_and_ends_at_decisions(check
 
     Rounds with cheap checks are also short relative to the iterations before them.
     """
-    (rounds,) = descent_rounds.init_rounds(1.0, check_cost).view(np.recarray)
+    (rounds,) = descent_rounds.init_rounds(1.0, check_cost, 3).view(np.recarray)
     ends = {0}
     while rounds.num_iterations < 200:
         size, n = descent_rounds.round_size(rounds), int(rounds.num_iterations)
@@ -283,6 +283,7 @@ def test_a_round_costs_a_quarter_more_than_the_least_and_ends_at_decisions(check
         ends.add(int(rounds.num_iterations))
         if rounds.num_iterations == rounds.group_end:
             rounds.group_end += descent_rounds.GROUP_ITERATIONS
+            rounds.segment_end = rounds.group_end
     assert {4, *range(10, 201, 10)} <= ends
 
 
