@@ -94,8 +94,8 @@ def test_a_recording_takes_at_most_20_bytes_a_vertex_and_frame(tmp_path: Path):
     [
         ("newton", 16, [6, 5, 5], 19.0),
         ("newton", 32, [8, 21, 11], 51.6),
-        ("hybrid", 16, [45, 39, 45], 3.0),
-        ("hybrid", 32, [32], 2.0),
+        ("hybrid", 16, [38, 34, 40], 3.0),
+        ("hybrid", 32, [27], 2.0),
     ],
 )
 def test_an_accuracy_takes_as_many_iterations_as_stored(
@@ -107,10 +107,10 @@ def test_an_accuracy_takes_as_many_iterations_as_stored(
         found = list(simulate_scene(scene, prepared, stop, initial_guess="previous", frames=len(iterations)))
     assert {step.solution.termination_reason for step in found} == {"converged"}
     # Newton's method converges quadratically, so that round-off does not change the counts. The hybrid begins with
-    # L-BFGS, in float32 unless the mesh is small. On another processor each phase of L-BFGS may end some iterations
+    # L-BFGS, in float32 unless the mesh is small. On another processor each phase of L-BFGS may end an iteration
     # earlier or later, and after a first step in float32 the next ones may take another path. A Newton step that this
     # adds needs a factorisation, or several if the Hessian is indefinite.
-    margin, more = (0, 1e-9) if solver == "newton" else (4, 6.0)
+    margin, more = (0, 1e-9) if solver == "newton" else (2, 6.0)
     assert [step.solution.num_iterations for step in found] == pytest.approx(iterations, abs=margin)
     assert isinstance(prepared, PreparedDescent)
     counted = prepared.fixed_objective.hessian_matrix.factor.num_factorisations  # one that fails counts as a part
