@@ -17,12 +17,12 @@ is no certified minimum reaches no accuracy.
 
 A method reaches an accuracy with its first iterate that satisfies it. A first pass evaluates all iterates. The methods
 that may be the fastest are then timed interleaved in one process, for several rounds, by the processor time of the
-thread and without evaluation. A timed solve follows an untimed one of the same method: the caches then hold its data,
-as after the previous step of a simulation. The interval is a bootstrap interval: it contains 95 % of the ratios of
-resampled rounds. The mark > denotes a ratio whose interval exceeds the first of LIMITS in a step that takes at least
-MIN_COUNTED_SECONDS; `inf` denotes an accuracy that the method does not reach. `configs/fastest.yaml` has
-other steps than `configs/accuracy.yaml`. The steps of `configs/unseen.yaml` were not used to choose any part of a
-solver.
+thread. What is timed is a solve with the number of iterations up to that iterate. A timed solve follows an untimed one
+of the same method: the caches then hold its data, as after the previous step of a simulation. The interval is a
+bootstrap interval: it contains 95 % of the ratios of resampled rounds. The mark > denotes a ratio whose interval
+exceeds the first of LIMITS in a step that takes at least MIN_COUNTED_SECONDS; `inf` denotes an accuracy that the method
+does not reach. `configs/fastest.yaml` has other steps than `configs/accuracy.yaml`. The steps of `configs/unseen.yaml`
+were not used to choose any part of a solver.
 """
 
 from __future__ import annotations

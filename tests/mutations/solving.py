@@ -57,8 +57,8 @@ _TABLE = (
     (
         "hybrid-shifted-steps-agree",
         "solvers/methods/newton/hybrid_newton.py",
-        "self.agrees_with_model = self._level == 0 and (",
-        "self.agrees_with_model = (",
+        "self.agrees_with_model = self._level == 0 and ",
+        "self.agrees_with_model = ",
         f"{_U}/test_hybrid.py::test_only_a_step_by_the_unmodified_hessian_agrees_with_its_model",
     ),
     (

@@ -93,10 +93,7 @@ from springbench.solvers.methods.newton.negative_curvature import (
     probe_negative_curvature,
 )
 from springbench.solvers.methods.newton.newton_direct import NewtonIteration, build_newton_arrays
-from springbench.solvers.methods.newton.newton_kernel import (
-    MODEL_RANGE,
-    NEWTON_PROGRESS_DTYPE,
-)
+from springbench.solvers.methods.newton.newton_kernel import NEWTON_PROGRESS_DTYPE, agrees_with_model
 from springbench.solvers.methods.newton.predicted_tension import (
     CompiledNewton,
     PredictedTensionNewton,
@@ -558,11 +555,10 @@ class MeasuredRule(ShiftScheduleRule):
         """
         slope = inner_product(at.gradient, at.positions - to.positions)
         self.decrease = fall = compute_objective_decrease(step, at, to)
-        low, high = MODEL_RANGE
         self._record_decrease(fall, slope)
         if self._level:
             self._gains[self._name] = fall / (self._factor.num_factorisations - self._before)
-        self.agrees_with_model = self._level == 0 and (fall == 0.0 or low * slope <= fall <= high * slope)
+        self.agrees_with_model = self._level == 0 and agrees_with_model(fall, slope)
         if self.agrees_with_model and slope > 0.0:
             self.decrement_ratio = inner_product(to.gradient, hessian.solve(to.gradient)) / slope
 
@@ -753,16 +749,16 @@ class HybridIteration:
         """
 
         def run_lbfgs() -> DescentPoint:
-            return self.relax_point(self.start_lbfgs(step, at.positions), step)
+            return self.relax_point(step, self.start_lbfgs(step, at.positions))
 
         return self.newton.iteration_phases(step, at) | {"lbfgs": run_lbfgs}
 
-    def relax_point(self, run: AcceleratedState, step: StepObjective) -> DescentPoint:
+    def relax_point(self, step: StepObjective, run: AcceleratedState) -> DescentPoint:
         """Return the point after a few iterations of L-BFGS.
 
         Args:
-            run: state of L-BFGS at the start of a solve.
             step: objective of the step.
+            run: state of L-BFGS at the start of a solve.
         """
         run.run_iterations(LoopLimits(_RELAXATION_ITERATIONS, 0.0, 0.0, RESIDUAL_NEVER))
         return self.read_point(step, run)
@@ -818,7 +814,6 @@ class MethodChoice:
         self._name = ""
         self._was_indefinite = False
         self._recent_steps: deque[tuple[float, float]] = deque(maxlen=_MEASURED_STEPS)  # [J], cost
-        self._decreases = np.empty(_MAX_COMPILED_STEPS)  # [J] in the last compiled steps of the exact method
         self._is_trial_due, self._patience, self._spent, self._fallen = False, _FIRST_PATIENCE, 0.0, 0.0
         self._trial_cost = _FIRST_PATIENCE * method.newton_cost  # spent by the others until the exact method is tried
 
@@ -958,8 +953,8 @@ class MethodChoice:
         The current point is returned if there are none; its Hessian, if it has a factor, is then factorised.
         """
         control, step, rule = self._control, self._step, self._rule
-        p, gradient, decreases = self._point.positions.copy(), self._point.gradient.copy(), self._decreases
-        progress = np.zeros(1, NEWTON_PROGRESS_DTYPE)
+        p, gradient = self._point.positions.copy(), self._point.gradient.copy()
+        decreases, progress = np.empty(_MAX_COMPILED_STEPS), np.zeros(1, NEWTON_PROGRESS_DTYPE)
         progress["steepest_slope"] = self._steepest
         fixed = compiled.arrays, step.step_data, step.exact_pins
         count, residual, _ = compiled.run_measured_steps.call(

@@ -10,8 +10,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numba.extending import register_jitable
 from numpy.typing import NDArray
-from springbench.solvers.jit.kernel_compilation import jit_inner, jit_kernel
+from springbench.solvers.jit.kernel_compilation import jit_inner, jit_inner_options, jit_kernel
 from springbench.solvers.kernels.descent_search import (
     SearchArrays,
     exceeds_roundoff,
@@ -45,9 +46,20 @@ NEWTON_PROGRESS_DTYPE = np.dtype(
 )
 """The progress of a solve."""
 
-MODEL_RANGE = (0.3, 0.7)
+_MODEL_RANGE = (0.3, 0.7)
 """Range of the decrease, as a fraction of the slope, in which a step agrees with the quadratic model: half of it for a
 full step on a quadratic function, three quarters for half a step."""
+
+
+@register_jitable(**jit_inner_options)
+def agrees_with_model(decrease: float, slope: float) -> bool:
+    """Return whether the decrease in a step agrees with the quadratic model.
+
+    Args:
+        decrease: decrease of the objective [J]; zero if it is round-off.
+        slope: derivative along the displacement at its start [J], positive for descent.
+    """
+    return decrease == 0.0 or _MODEL_RANGE[0] * slope <= decrease <= _MODEL_RANGE[1] * slope
 
 
 class NewtonArrays(NamedTuple):
@@ -183,8 +195,8 @@ def run_exact_steps(arrays, step_data, exact_pins, limits, p, gradient, progress
 def run_measured_steps(arrays, step_data, exact_pins, limits, max_ratio, p, gradient, decreases, progress):
     """Run steps as long as they agree with the quadratic model and converge fast enough.
 
-    A step agrees if the decrease is in `MODEL_RANGE`, relative to the slope. Its convergence is measured by the ratio
-    of the squared Newton decrements g'H^-1 g after and before it, both with the Hessian before it.
+    The convergence of a step is measured by the ratio of the squared Newton decrements g'H^-1 g after and before it,
+    both with the Hessian before it.
 
     Args:
         arrays: arrays of the system.
@@ -234,7 +246,7 @@ def _take_measured_step(state, decrease):
     decrease[0] = max(0.0, -change_objective(search.objective_terms, search.quadratic_form, step_data, p, q))
     move_to_trial(search, p, gradient)
     now.slope, now.agrees_with_model = slope, 0
-    if decrease[0] == 0.0 or MODEL_RANGE[0] * slope <= decrease[0] <= MODEL_RANGE[1] * slope:
+    if agrees_with_model(decrease[0], slope):
         now.agrees_with_model = 1
         if slope > 0.0:
             solve_negative(arrays, arrays.factor.solve_schedule, gradient)

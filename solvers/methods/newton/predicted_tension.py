@@ -78,12 +78,12 @@ class RelaxationMethod(Protocol):
         """
         ...
 
-    def relax_point(self, run: AcceleratedState, step: StepObjective) -> DescentPoint:
+    def relax_point(self, step: StepObjective, run: AcceleratedState) -> DescentPoint:
         """Return the point after local relaxation, which removes the second-order stretch of a step.
 
         Args:
-            run: state of L-BFGS at the end of a Newton step.
             step: objective of the step.
+            run: state of L-BFGS at the end of a Newton step.
         """
         ...
 
@@ -96,7 +96,6 @@ class FullStep(NamedTuple):
         slope: derivative along it [J].
         predicted: tensions linearised for it (m,) [N].
         positions: positions at its end (n, 3) [m].
-        change: change of the objective [J].
         gradient: gradient there (n, 3) [N]; None unless the decrease agrees with the quadratic model.
     """
 
@@ -104,7 +103,6 @@ class FullStep(NamedTuple):
     slope: float
     predicted: NDArray[np.float64]
     positions: Positions
-    change: float
     gradient: Positions | None
 
 
@@ -198,20 +196,18 @@ class PredictedTensionNewton:
             direction = -descent
             slope, p = inner_product(at.gradient, direction), step.apply_exact_pins(at.positions + direction)
             predicted = step.linearise_tensions(at.positions, direction)
-            change = step.objective_change(at.positions, p)[0]
-            gradient = step.gradient(p) if change <= MODEL_DECREASE_FRACTION * slope else None
-            return FullStep(direction, slope, predicted, p, change, gradient)
+            is_sufficient = step.objective_change(at.positions, p)[0] <= MODEL_DECREASE_FRACTION * slope
+            return FullStep(direction, slope, predicted, p, step.gradient(p) if is_sufficient else None)
         p, gradient = np.empty_like(at.positions), np.empty_like(at.positions)
         predicted, fixed = np.empty_like(self._predicted_tensions), (compiled.arrays, step.step_data, step.exact_pins)
         hessian, outputs = (self._predicted_tensions, keep, by), (predicted, p, gradient)
-        failed, slope, change = compiled.try_full_step.call(
+        failed, slope, is_sufficient = compiled.try_full_step.call(
             *fixed, *hessian, MODEL_DECREASE_FRACTION, at.positions, at.gradient, *outputs
         )
         step.fixed_objective.hessian_matrix.factor.count_factorisations(int(failed < 0), failed)
         if failed >= 0:
             return None
-        is_sufficient = change <= MODEL_DECREASE_FRACTION * slope
-        return FullStep(compiled.arrays.direction, slope, predicted, p, change, gradient if is_sufficient else None)
+        return FullStep(compiled.arrays.direction, slope, predicted, p, gradient if is_sufficient else None)
 
     def _line_search(self, at: DescentPoint, full: FullStep) -> tuple[float, DescentPoint | None, bool]:
         """Return the step size, the new point, and whether the decrease agrees with the model."""
@@ -231,7 +227,7 @@ class PredictedTensionNewton:
         """Return the point after local relaxation of positions p (n, 3) [m]."""
         last, step = self._relaxation, self._step
         run = self._relaxation = self._method.start_lbfgs(step, p) if last is None else last.restart_at(p)
-        return self._method.relax_point(run, step)
+        return self._method.relax_point(step, run)
 
 
 def compute_objective_decrease(step: StepObjective, before: DescentPoint, after: DescentPoint) -> float:

@@ -29,7 +29,7 @@ def try_full_step(
         tensions: tensions of the springs in the Hessian (m,) [N].
         negative_fraction: factor of the springs' negative transverse parts.
         shift: multiple of the inertia that is added.
-        min_fraction: fraction of the slope by which the objective must decrease for a gradient.
+        min_fraction: fraction of the slope from which the decrease of the objective is sufficient.
         p: positions (n, 3) [m].
         gradient: gradient there (n, 3) [N].
         predicted: output, tensions linearised for the direction (m,) [N].
@@ -37,7 +37,7 @@ def try_full_step(
         there: output, gradient there (n, 3) [N], if the decrease is sufficient.
 
     Returns:
-        The supernode at which the factorisation failed or -1, the slope, and the change of the objective [J].
+        The supernode at which the factorisation failed or -1, the slope [J], and whether the decrease is sufficient.
     """
     terms, form, places = arrays.search.objective_terms, arrays.search.quadratic_form, arrays.block_indices
     assemble_hessian(terms, places, arrays.constant_blocks, p, tensions, negative_fraction, arrays.values)
@@ -47,14 +47,14 @@ def try_full_step(
                 arrays.values[places.diagonal_block[v], c, c] += shift * terms.inertia_diagonal[v]
     failed = solve_negative(arrays, arrays.factor.schedule, gradient)
     if failed >= 0:
-        return failed, 0.0, 0.0
+        return failed, 0.0, False
     slope = compute_inner_product(gradient, arrays.direction)
     linearise_tensions(terms, p, arrays.direction, predicted)
     for v in range(len(p)):
         for c in range(3):
             q[v, c] = p[v, c] + arrays.direction[v, c]
     move_to_targets(exact_pins, q)
-    change = change_objective(terms, form, step_data, p, q)
-    if change <= min_fraction * slope:
+    is_sufficient = change_objective(terms, form, step_data, p, q) <= min_fraction * slope
+    if is_sufficient:
         write_free_gradient(terms, form, step_data, exact_pins, q, there)
-    return failed, slope, change
+    return failed, slope, is_sufficient
