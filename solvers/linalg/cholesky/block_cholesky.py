@@ -9,6 +9,7 @@ that fails is a regular result, not an error: H is then not positive definite.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numba
@@ -167,17 +168,22 @@ class BlockCholesky:
         schedule, solve_schedule, scratch, team, *_ = self._workspaces[1]
         return KernelFactor(self.fronts, schedule, solve_schedule, self.panels, scratch, team)
 
-    def count_factorisations(self, num_complete: int, failed_supernode: int) -> None:
+    def count_factorisations(self, number: float, failed_supernode: int = -1) -> None:
         """Add factorisations to the count.
 
         Args:
-            num_complete: number of those that succeeded.
+            number: number of factorisations, a fraction for those that failed.
             failed_supernode: supernode at which one more failed, -1 for none.
         """
-        self._count.total += num_complete
+        self._count.total += number
         if failed_supernode >= 0:
-            done = float(self._flops[:failed_supernode].sum()) / self.flops
-            self._count.total += max(_MIN_FACTORISATION, done)
+            self._count.total += float(self.failure_costs[failed_supernode])
+
+    @cached_property
+    def failure_costs(self) -> NDArray[np.float64]:
+        """Cost of a factorisation that fails at a supernode, relative to a whole one, for each supernode (s,)."""
+        done = np.concatenate([[0.0], np.cumsum(self._flops)[:-1]]) / self.flops
+        return np.maximum(_MIN_FACTORISATION, done)
 
     def _current_workspace(self) -> _Workspace:
         """Return the workspace for the current number of threads."""

@@ -55,6 +55,11 @@ class AcceleratedState(SolverState):
     def gradient(self) -> Positions:
         """Return the gradient of the objective [N], (n, 3), at the iterate."""
 
+    @property
+    def kernel_data(self) -> tuple[Any, Any, Any, Any, Any] | None:
+        """Data for kernels that continue with iterations of the solve; None if the iterations are not compiled."""
+        return None
+
     @abstractmethod
     def restart_at(self, p: Positions) -> Self:
         """Return a state of the same step that starts at positions p (n, 3) [m].

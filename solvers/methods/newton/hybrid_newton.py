@@ -48,7 +48,7 @@ continues.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from math import isnan
@@ -95,10 +95,13 @@ from springbench.solvers.methods.newton.negative_curvature import (
 from springbench.solvers.methods.newton.newton_direct import NewtonIteration, build_newton_arrays
 from springbench.solvers.methods.newton.newton_kernel import NEWTON_PROGRESS_DTYPE, agrees_with_model
 from springbench.solvers.methods.newton.predicted_tension import (
+    MAX_COMPILED_STEPS,
+    RELAXATION_ITERATIONS,
     CompiledNewton,
     PredictedTensionNewton,
     compute_objective_decrease,
 )
+from springbench.solvers.methods.newton.predicted_tension_kernel import StepBudget
 from springbench.solvers.methods.quasi_newton.lbfgs import Lbfgs
 from springbench.solvers.methods.quasi_newton.lbfgs_with_sweeps import LbfgsSweepEngine, LbfgsSweepState
 from springbench.solvers.methods.quasi_newton.sweep_rounds import ROUND_SWEEPS
@@ -107,9 +110,6 @@ from springbench.solvers.model.barrier_energy import ignore_barriers, without_ba
 from springbench.solvers.model.step_problem import Positions, PreparedSolver, StepProblem, System
 from springbench.solvers.objective.fixed_objective import FixedObjective
 from springbench.solvers.objective.step_objective import Hessian, StepObjective
-
-_RELAXATION_ITERATIONS = 5
-"""L-BFGS iterations after a Newton step with predicted tensions."""
 
 _CACHED_ENTRIES = 2**15
 """Entries of a factor of Q that fit in a core's second-level cache, 256 KiB: there float64 costs as much as float32,
@@ -123,9 +123,6 @@ _FIRST_PATIENCE = 10.0
 
 _MEASURED_STEPS = 3
 """Number of consecutive steps of a Newton method whose decrease per cost is compared: single steps vary widely."""
-
-_MAX_COMPILED_STEPS = 16
-"""Maximum number of steps of Newton's method in one call of a kernel."""
 
 _MAX_SHIFT = 1e3
 """Largest multiple of the inertia that is added to an exact Hessian; then its negative parts are reduced instead."""
@@ -749,19 +746,11 @@ class HybridIteration:
         """
 
         def run_lbfgs() -> DescentPoint:
-            return self.relax_point(step, self.start_lbfgs(step, at.positions))
+            run = self.start_lbfgs(step, at.positions)
+            run.run_iterations(LoopLimits(RELAXATION_ITERATIONS, 0.0, 0.0, RESIDUAL_NEVER))
+            return self.read_point(step, run)
 
         return self.newton.iteration_phases(step, at) | {"lbfgs": run_lbfgs}
-
-    def relax_point(self, step: StepObjective, run: AcceleratedState) -> DescentPoint:
-        """Return the point after a few iterations of L-BFGS.
-
-        Args:
-            step: objective of the step.
-            run: state of L-BFGS at the start of a solve.
-        """
-        run.run_iterations(LoopLimits(_RELAXATION_ITERATIONS, 0.0, 0.0, RESIDUAL_NEVER))
-        return self.read_point(step, run)
 
     def read_point(self, step: StepObjective, run: AcceleratedState) -> DescentPoint:
         """Return the current point of L-BFGS.
@@ -804,6 +793,7 @@ class MethodChoice:
         """
         self._method, self._step, self._start, self._control = method, step, start, control
         self._run: AcceleratedState | None = run
+        self._idle_run: AcceleratedState | None = None
         self._point, self._rounds = at or DescentPoint(start, NO_GRADIENT), rounds
         self._num_lbfgs_iterations, self._rival_gain = 0, 0.0  # last values read from and written to `rounds`
         self._measured_rule: MeasuredRule | None = None
@@ -834,7 +824,8 @@ class MethodChoice:
                 else:
                     if self._run is not None:  # the gradient of L-BFGS has the round-off of its kernel
                         positions = self._point.positions
-                        self._point, self._run = DescentPoint(positions, self._step.gradient(positions)), None
+                        self._point = DescentPoint(positions, self._step.gradient(positions))
+                        self._idle_run, self._run = self._run, None
                     point = self._take_exact_steps() if name == "newton" else self._take_predicted_step()
             if point is not self._point:
                 self._point, self._control.is_minimum = point, self._agrees_with_model
@@ -944,7 +935,7 @@ class MethodChoice:
             fall = compute_objective_decrease(self._step, self._point, point)
         else:
             fall = rule.decrease
-        self._record_step("newton", point, fall, method.factor.num_factorisations - before)
+        self._record_steps("newton", point, [fall], [method.factor.num_factorisations - before])
         return point
 
     def _run_compiled_steps(self, compiled: CompiledNewton) -> DescentPoint:
@@ -954,7 +945,7 @@ class MethodChoice:
         """
         control, step, rule = self._control, self._step, self._rule
         p, gradient = self._point.positions.copy(), self._point.gradient.copy()
-        decreases, progress = np.empty(_MAX_COMPILED_STEPS), np.zeros(1, NEWTON_PROGRESS_DTYPE)
+        decreases, progress = np.empty(MAX_COMPILED_STEPS), np.zeros(1, NEWTON_PROGRESS_DTYPE)
         progress["steepest_slope"] = self._steepest
         fixed = compiled.arrays, step.step_data, step.exact_pins
         count, residual, _ = compiled.run_measured_steps.call(
@@ -969,13 +960,12 @@ class MethodChoice:
             return self._point
         rule.record_compiled_steps(progress, float(decreases[count - 1]))
         point = DescentPoint(p, gradient)
-        for k in range(count):
-            self._record_step("newton", point, float(decreases[k]), 1.0)
+        self._record_steps("newton", point, decreases[:count].tolist(), [1.0] * count)
         control.num_iterations, control.residual = count, None if isnan(residual) else residual
         return point
 
     def _take_predicted_step(self) -> DescentPoint:
-        """Return the point after a step with predicted tensions."""
+        """Return the point after a step with predicted tensions, or several compiled ones."""
         step, point, before = self._step, self._point, self._method.factor.num_factorisations
         if self._predicting is None:
             self._predicting = PredictedTensionNewton(self._method, step, self._origin())
@@ -983,37 +973,61 @@ class MethodChoice:
             if is_past_saddle:
                 self._gains["lbfgs"] = np.inf
         else:
+            if self._predicting.relaxation is None:
+                self._predicting.relaxation, self._idle_run = self._idle_run, None
+            if (compiled := self._run_compiled_predicted_steps(self._predicting)) is not None:
+                return compiled
             following, fall, self._is_trial_due = self._predicting.compute_next_step(point)
-        self._record_step("predicted tensions", following, fall, self._method.factor.num_factorisations - before)
+        self._record_steps("predicted tensions", following, [fall], [self._method.factor.num_factorisations - before])
         return following
+
+    def _run_compiled_predicted_steps(self, predicting: PredictedTensionNewton) -> DescentPoint | None:
+        """Return the point after compiled steps with predicted tensions; None if there are none."""
+        method, control, recent = self._method, self._control, np.zeros((2, _MEASURED_STEPS))
+        if self._recent_steps:
+            recent[:, -len(self._recent_steps) :] = np.transpose(self._recent_steps)
+        min_gain = max(self._gains["lbfgs"], self._gains["newton"])
+        budget = StepBudget(min_gain, method.newton_cost, method.factor.failure_costs, self._spent, self._trial_cost)
+        found = predicting.run_compiled_steps(self._point, control.limits, budget, recent)
+        if found is None:
+            return None
+        method.factor.count_factorisations(sum(found.costs))
+        self._is_trial_due = found.is_trial_due
+        self._record_steps("predicted tensions", found.point, found.decreases, found.costs)
+        control.num_iterations, control.residual = len(found.costs), found.residual
+        return found.point
 
     def _origin(self) -> DescentPoint:
         """Return the point at which the solve started."""
         return DescentPoint(self._start, self._step.gradient(self._start))
 
-    def _record_step(self, name: str, to: DescentPoint, fall: float, num_factorisations: float) -> None:
-        """Record the decrease per cost of a Newton step.
+    def _record_steps(
+        self, name: str, to: DescentPoint, decreases: Sequence[float], num_factorisations: Sequence[float]
+    ) -> None:
+        """Record the decreases per cost of Newton steps that led to a point.
 
-        This also determines when the exact method is tried next.
+        They also determine when the exact method is tried next.
         """
-        cost = self._method.newton_cost * num_factorisations
-        self._control.add_phase(name, int(to.positions is not self._point.positions), num_factorisations)
-        if fall == 0.0:
-            self._recent_steps.clear()
-        self._recent_steps.append((fall, cost))
-        total_fall, total_cost = map(sum, zip(*self._recent_steps, strict=True))
-        if fall > 0.0 or name == "newton" or self._is_trial_due:
+        count, spent, recent = len(decreases), sum(num_factorisations), self._recent_steps
+        self._control.add_phase(name, count if to.positions is not self._point.positions else 0, spent)
+        for fall, number in zip(decreases, num_factorisations, strict=True):
+            if fall == 0.0:
+                recent.clear()
+            recent.append((fall, self._method.newton_cost * number))
+        total_fall, total_cost = map(sum, zip(*recent, strict=True))
+        if decreases[-1] > 0.0 or name == "newton" or self._is_trial_due:
             self._gains[name] = total_fall / total_cost if total_cost > 0.0 else 0.0
         if name == "newton":
-            others = self._fallen / self._spent if self._spent > 0.0 else 0.0
+            others = self._fallen / self._spent if self._spent > 0.0 and count == 1 else 0.0
             is_better = self._converges_faster or self._gains["newton"] > others
-            self._patience = _FIRST_PATIENCE if is_better else 2.0 * self._patience
+            before = self._patience if count == 1 else _FIRST_PATIENCE
+            self._patience = _FIRST_PATIENCE if is_better else 2.0 * before
             self._is_trial_due, self._spent, self._fallen = False, 0.0, 0.0
             rounds = self._rounds
-            self._trial_cost = self._patience * (cost or self._method.newton_cost)
+            self._trial_cost = self._patience * (recent[-1][1] or self._method.newton_cost)
             rounds["trial_iteration"] = rounds["num_iterations"] + GROUP_ITERATIONS * self._trial_cost
         else:
-            self._spent, self._fallen = self._spent + cost, self._fallen + fall
+            self._spent, self._fallen = self._spent + self._method.newton_cost * spent, self._fallen + sum(decreases)
             self._is_trial_due |= self._spent >= self._trial_cost
 
     def _escape(self) -> DescentPoint | None:

@@ -14,6 +14,8 @@ from collections.abc import Callable
 from typing import TypeVar
 
 import numpy as np
+from numba.extending import register_jitable
+from springbench.solvers.jit.kernel_compilation import jit_inner_options
 
 MODEL_DECREASE_FRACTION = 0.25
 """The quadratic model counts as accurate if a full step decreases the objective by this fraction of the linear
@@ -25,11 +27,40 @@ _MIN_SHIFT, _SHIFT_RATIO = 0.1, 4.0
 _Found = TypeVar("_Found")
 
 
+@register_jitable(**jit_inner_options)
+def reduce_shift(value: float, ratio: float, max_value: float) -> float:
+    """Return the smaller shift that is tried next.
+
+    Args:
+        value: current shift, positive.
+        ratio: ratio of its reduction.
+        max_value: largest finite shift.
+    """
+    less = min(value / ratio, max_value)
+    return less if less >= _MIN_SHIFT else 0.0
+
+
+@register_jitable(**jit_inner_options)
+def adapt_shift_ratio(value: float, ratio: float, has_factor: bool) -> float:
+    """Return the ratio of the next reduction.
+
+    Args:
+        value: shift before a reduction.
+        ratio: ratio of that reduction.
+        has_factor: whether the smaller shift had a factor.
+    """
+    if has_factor:
+        return min(_SHIFT_RATIO, ratio**2)
+    return ratio**0.5 if value < np.inf else _SHIFT_RATIO
+
+
 class InertiaShift:
     """The shift in one solve.
 
     Attributes:
         value: the multiple s; infinite for a Hessian that is made positive definite by another method.
+        max_value: largest finite multiple.
+        ratio: ratio of the next reduction.
         can_reduce: whether the quadratic model was accurate in the last step, so that a smaller value is tried.
     """
 
@@ -40,7 +71,7 @@ class InertiaShift:
             value: first multiple of the inertia; infinite to start with another modification of the Hessian.
             max_value: largest finite multiple; beyond it the value is infinite.
         """
-        self.value, self.can_reduce, self._max_value, self._ratio = value, False, max_value, _SHIFT_RATIO
+        self.value, self.can_reduce, self.max_value, self.ratio = value, False, max_value, _SHIFT_RATIO
 
     def find_smallest(self, attempt: Callable[[float], _Found | None]) -> _Found | None:
         """Return the result of the first shift that has a factor, and store that shift.
@@ -49,14 +80,13 @@ class InertiaShift:
             attempt: function of a shift that returns None if there is no factor.
         """
         if self.can_reduce and self.value > 0.0:
-            less = min(self.value / self._ratio, self._max_value)
-            less = less if less >= _MIN_SHIFT else 0.0
+            less = reduce_shift(self.value, self.ratio, self.max_value)
             found = attempt(less)
+            self.ratio = adapt_shift_ratio(self.value, self.ratio, found is not None)
             if found is not None:
-                self.value, self._ratio = less, min(_SHIFT_RATIO, self._ratio**2)
+                self.value = less
                 return found
-            self._ratio = self._ratio**0.5 if self.value < np.inf else _SHIFT_RATIO
         while (found := attempt(self.value)) is None and self.value < np.inf:
-            self.value, self._ratio = max(_MIN_SHIFT, _SHIFT_RATIO * self.value), _SHIFT_RATIO
-            self.value = self.value if self.value <= self._max_value else np.inf
+            self.value, self.ratio = max(_MIN_SHIFT, _SHIFT_RATIO * self.value), _SHIFT_RATIO
+            self.value = self.value if self.value <= self.max_value else np.inf
         return found

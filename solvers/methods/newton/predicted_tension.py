@@ -8,6 +8,7 @@
 
 from __future__ import annotations
 
+from math import isnan
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -19,18 +20,28 @@ from springbench.solvers.iteration.descent_method import (
     inner_product,
 )
 from springbench.solvers.jit.typed_kernel import TypedKernel
+from springbench.solvers.kernels.iteration_loop import RESIDUAL_NEVER, LoopLimits
 from springbench.solvers.kernels.line_search_conditions import is_armijo_step
 from springbench.solvers.methods.local_global.accelerated_local_global import AcceleratedState
 from springbench.solvers.methods.newton.inertia_shift import MODEL_DECREASE_FRACTION, InertiaShift
 from springbench.solvers.methods.newton.negative_curvature import probe_negative_curvature
 from springbench.solvers.methods.newton.newton_kernel import NewtonArrays, run_measured_steps
-from springbench.solvers.methods.newton.predicted_tension_kernel import try_full_step
+from springbench.solvers.methods.newton.predicted_tension_kernel import (
+    PREDICTED_PROGRESS_DTYPE,
+    QUADRATIC_SLOPE_RATIO,
+    Relaxation,
+    StepBudget,
+    run_predicted_steps,
+    try_full_step,
+)
 from springbench.solvers.model.step_problem import Positions
 from springbench.solvers.objective.step_objective import StepObjective
 
-_QUADRATIC_SLOPE_RATIO = 0.1
-"""Near a minimum a Newton step leaves at most this fraction of the slope."""
+RELAXATION_ITERATIONS = 5
+"""L-BFGS iterations after a step."""
 
+MAX_COMPILED_STEPS = 16
+"""Maximum number of Newton steps in one call of a kernel."""
 
 _MAX_SHIFT = 10.0
 """Largest multiple of the inertia that is added; then the negative parts of the springs are dropped instead."""
@@ -43,28 +54,31 @@ class CompiledNewton(NamedTuple):
         arrays: arrays of the system.
         run_measured_steps: `springbench.solvers.methods.newton.newton_kernel.run_measured_steps`.
         try_full_step: `springbench.solvers.methods.newton.predicted_tension_kernel.try_full_step`.
+        run_predicted_steps: `run_predicted_steps` of the same module.
     """
 
     arrays: NewtonArrays
     run_measured_steps: TypedKernel
     try_full_step: TypedKernel
+    run_predicted_steps: TypedKernel
 
     @classmethod
     def from_arrays(cls, arrays: NewtonArrays) -> CompiledNewton:
         """Create the kernels for the arrays of a system."""
-        return cls(arrays, TypedKernel(run_measured_steps), TypedKernel(try_full_step))
+        return cls(arrays, *map(TypedKernel, (run_measured_steps, try_full_step, run_predicted_steps)))
 
 
 class RelaxationMethod(Protocol):
     """The data of the method for one system.
 
     The diagonals are those of the inertia and of Q, (3f,) [N/m]. `compiled_newton` are the compiled steps; None if they
-    are not supported.
+    are not supported. `is_very_stiff` is whether gradients of L-BFGS have too much round-off.
     """
 
     metric: ResidualMetric
     inertia_diagonal: NDArray[np.float64]
     system_diagonal: NDArray[np.float64]
+    is_very_stiff: bool
 
     @property
     def compiled_newton(self) -> CompiledNewton | None: ...
@@ -78,14 +92,32 @@ class RelaxationMethod(Protocol):
         """
         ...
 
-    def relax_point(self, step: StepObjective, run: AcceleratedState) -> DescentPoint:
-        """Return the point after local relaxation, which removes the second-order stretch of a step.
+    def read_point(self, step: StepObjective, run: AcceleratedState) -> DescentPoint:
+        """Return the current point of L-BFGS.
 
         Args:
             step: objective of the step.
-            run: state of L-BFGS at the end of a Newton step.
+            run: state of L-BFGS.
         """
         ...
+
+
+class PredictedSteps(NamedTuple):
+    """Result of compiled steps.
+
+    Attributes:
+        point: last point.
+        decreases: decrease of the objective in each step [J].
+        costs: factorisations in each step.
+        residual: residual [J^(1/2)] at the last point, None if it is not known.
+        is_trial_due: whether to continue with the exact Hessian.
+    """
+
+    point: DescentPoint
+    decreases: list[float]
+    costs: list[float]
+    residual: float | None
+    is_trial_due: bool
 
 
 class FullStep(NamedTuple):
@@ -107,7 +139,11 @@ class FullStep(NamedTuple):
 
 
 class PredictedTensionNewton:
-    """Newton's method with predicted tensions in one solve."""
+    """Newton's method with predicted tensions in one solve.
+
+    Attributes:
+        relaxation: state of L-BFGS of the same step, which relaxations restart; None to create one.
+    """
 
     def __init__(self, method: RelaxationMethod, step: StepObjective, origin: DescentPoint) -> None:
         """Create the state of a solve.
@@ -121,7 +157,7 @@ class PredictedTensionNewton:
         self._first_point: DescentPoint | None = origin
         self._predicted_tensions = np.zeros(len(step.fixed_objective.springs.stiffness))
         self._shift, self._slope = InertiaShift(np.inf, _MAX_SHIFT), -np.inf
-        self._relaxation: AcceleratedState | None = None
+        self.relaxation: AcceleratedState | None = None
 
     def compute_first_step(self, at: DescentPoint) -> tuple[DescentPoint, float, bool]:
         """Do the first step, with the true tensions.
@@ -179,7 +215,42 @@ class PredictedTensionNewton:
         gain = compute_objective_decrease(step, point, following)
         if gain == 0.0:
             return point, 0.0, at is point
-        return following, gain, self._shift.value == 0.0 and is_sufficient and slope >= _QUADRATIC_SLOPE_RATIO * before
+        return following, gain, self._shift.value == 0.0 and is_sufficient and slope >= QUADRATIC_SLOPE_RATIO * before
+
+    def run_compiled_steps(
+        self, point: DescentPoint, limits: LoopLimits, budget: StepBudget, recent: NDArray[np.float64]
+    ) -> PredictedSteps | None:
+        """Do steps that need no line search and no larger shift, compiled.
+
+        Args:
+            point: current point; the first step starts as that of `compute_next_step`.
+            limits: limits, in steps.
+            budget: what ends the steps.
+            recent: decrease [J] and cost of the last steps (2, k), the last one last; zero for no step; overwritten.
+
+        Returns:
+            None if there are no such steps, or if they are not supported.
+        """
+        compiled, step, shift = self._method.compiled_newton, self._step, self._shift
+        data = self.relaxation and self.relaxation.kernel_data
+        if compiled is None or data is None:
+            return None
+        relaxation = Relaxation(*data, RELAXATION_ITERATIONS, not self._method.is_very_stiff)
+        progress = np.zeros(1, PREDICTED_PROGRESS_DTYPE)
+        progress[0] = shift.value, shift.max_value, shift.ratio, shift.can_reduce, self._slope, False
+        at = self._first_point or point
+        p, gradient, (decreases, costs) = at.positions.copy(), at.gradient.copy(), np.empty((2, MAX_COMPILED_STEPS))
+        fixed, tensions = (compiled.arrays, step.step_data, step.exact_pins), self._predicted_tensions
+        outputs = tensions, np.empty_like(tensions), p, gradient, recent, decreases, costs, progress
+        count, residual = compiled.run_predicted_steps.call(
+            *fixed, relaxation, limits, budget, point.positions, self._first_point is not None, *outputs
+        )
+        if count == 0:
+            return None
+        shift.value, _, shift.ratio, can_reduce, self._slope, is_trial_due = progress[0].item()
+        shift.can_reduce, self._first_point = bool(can_reduce), None
+        last, known = DescentPoint(p, gradient), None if isnan(residual) else residual
+        return PredictedSteps(last, decreases[:count].tolist(), costs[:count].tolist(), known, bool(is_trial_due))
 
     def _try_full_step(self, at: DescentPoint, shift: float) -> FullStep | None:
         """Return the full step with a multiple of the inertia added.
@@ -201,12 +272,11 @@ class PredictedTensionNewton:
         p, gradient = np.empty_like(at.positions), np.empty_like(at.positions)
         predicted, fixed = np.empty_like(self._predicted_tensions), (compiled.arrays, step.step_data, step.exact_pins)
         hessian, outputs = (self._predicted_tensions, keep, by), (predicted, p, gradient)
-        failed, slope, is_sufficient = compiled.try_full_step.call(
-            *fixed, *hessian, MODEL_DECREASE_FRACTION, at.positions, at.gradient, *outputs
-        )
+        failed, slope, change = compiled.try_full_step.call(*fixed, *hessian, at.positions, at.gradient, *outputs)
         step.fixed_objective.hessian_matrix.factor.count_factorisations(int(failed < 0), failed)
         if failed >= 0:
             return None
+        is_sufficient = change <= MODEL_DECREASE_FRACTION * slope
         return FullStep(compiled.arrays.direction, slope, predicted, p, gradient if is_sufficient else None)
 
     def _line_search(self, at: DescentPoint, full: FullStep) -> tuple[float, DescentPoint | None, bool]:
@@ -224,10 +294,14 @@ class PredictedTensionNewton:
         return length, self._relax_point(found.positions), False
 
     def _relax_point(self, p: Positions) -> DescentPoint:
-        """Return the point after local relaxation of positions p (n, 3) [m]."""
-        last, step = self._relaxation, self._step
-        run = self._relaxation = self._method.start_lbfgs(step, p) if last is None else last.restart_at(p)
-        return self._method.relax_point(step, run)
+        """Return the point after local relaxation of positions p (n, 3) [m].
+
+        It removes the second-order stretch of a step.
+        """
+        last, step = self.relaxation, self._step
+        run = self.relaxation = self._method.start_lbfgs(step, p) if last is None else last.restart_at(p)
+        run.run_iterations(LoopLimits(RELAXATION_ITERATIONS, 0.0, 0.0, RESIDUAL_NEVER))
+        return self._method.read_point(step, run)
 
 
 def compute_objective_decrease(step: StepObjective, before: DescentPoint, after: DescentPoint) -> float:

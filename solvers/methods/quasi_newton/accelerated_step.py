@@ -77,6 +77,32 @@ def start_solve(step: AcceleratedStep, window: AccelerationWindow, target, force
 
 
 @jit_inner
+def iterate_from(step, window, target, force, pin_targets, num_iterations, p, gradient):
+    """Do iterations from positions, at most up to the first that finds no descent.
+
+    Args:
+        step: data of the system; its vectors and objective values are overwritten.
+        window: state of the solve, initialised at the positions.
+        target: inertial target (n, 3) [m].
+        force: external force and constant force of the forms (n, 3) [N].
+        pin_targets: target positions of the pins (q, 3) [m].
+        num_iterations: number of iterations.
+        p: positions (n, 3) [m], updated.
+        gradient: output, gradient there (n, 3) [N].
+    """
+    _evaluate_guess(step, window, target, force, pin_targets, p)
+    _start_window(step, window)
+    for _ in range(num_iterations):
+        if not step_state((step, window)):
+            break
+    read_positions(step.vertex_rows, window.position, p)
+    read_positions(step.vertex_rows, window.descent, gradient)
+    for v in range(len(gradient)):
+        for c in range(3):
+            gradient[v, c] = -gradient[v, c]
+
+
+@jit_inner
 def start_lower_solve(step, window, target, force, pin_targets, guess, external_force, measures_guess, out):
     """Start the solve at the lower of a guess and the inertial prediction.
 

@@ -279,6 +279,15 @@ class CompiledAccelerationState(CompiledState, AcceleratedState):
         self._step_arrays = *self._step_arrays[:-1], as_kernel_array(p)
         return self.start_at_guess()
 
+    @property
+    def kernel_data(self) -> tuple[Any, Any, Any, Any, Any] | None:
+        """Data and state of the solve, inertial target, force and pin targets, as in `accelerated_step.iterate_from`.
+
+        It is None for energies with scales of cancellation, which are not computed in kernels.
+        """
+        target, force, pin_targets, _ = self._step_arrays
+        return None if self._engine.has_energy_scales else (*self._state, target, force, pin_targets)
+
     def _add_energy_scales(self, p: Positions) -> None:
         """Add the scales of cancellation in forms and edges at the start p (n, 3) [m]."""
         parts, values = self._engine.spring_form, self._state[0].objective_values
