@@ -78,7 +78,7 @@ class SpringForm:
         Args:
             p: positions (n, 3) [m], as of `as_kernel_array`.
         """
-        return 0.5 * self._sum_squared_stretch.call(*self._negative_pairs, p) if self.form_builders else 0.0
+        return 0.5 * self._sum_squared_stretch.call(*self.negative_pairs, p) if self.form_builders else 0.0
 
     @property
     def has_edges(self) -> bool:
@@ -86,7 +86,7 @@ class SpringForm:
         return bool(self.strain_limits or self.dashpots)
 
     @cached_property
-    def _negative_pairs(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    def negative_pairs(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """The pairs with negative stiffness (m, 2), and its absolute value (m,) [N/m]."""
         pairs = self.springs_and_forms
         below = pairs.stiffness < 0.0

@@ -130,6 +130,13 @@ _TABLE = (
         f"{_U}/test_compiled_iterations.py",
     ),
     (
+        "compiled-tension-prediction",
+        "solvers/methods/newton/predicted_tension_kernel.py",
+        "tensions[e] += length * (state.predicted[e] - tensions[e])",
+        "tensions[e] += 0.5 * length * (state.predicted[e] - tensions[e])",
+        f"{_U}/test_compiled_iterations.py",
+    ),
+    (
         "compiled-newton-cg-tolerance",
         "solvers/methods/newton/newton_cg_kernel.py",
         "max(MIN_ETA, 0.9 * square / square_before,",

@@ -935,7 +935,7 @@ class MethodChoice:
             fall = compute_objective_decrease(self._step, self._point, point)
         else:
             fall = rule.decrease
-        self._record_steps("newton", point, [fall], [method.factor.num_factorisations - before])
+        self._record_step("newton", point, fall, method.factor.num_factorisations - before)
         return point
 
     def _run_compiled_steps(self, compiled: CompiledNewton) -> DescentPoint:
@@ -960,7 +960,7 @@ class MethodChoice:
             return self._point
         rule.record_compiled_steps(progress, float(decreases[count - 1]))
         point = DescentPoint(p, gradient)
-        self._record_steps("newton", point, decreases[:count].tolist(), [1.0] * count)
+        self._record_steps("newton", count, decreases[:count].tolist(), [1.0] * count)
         control.num_iterations, control.residual = count, None if isnan(residual) else residual
         return point
 
@@ -978,11 +978,11 @@ class MethodChoice:
             if (compiled := self._run_compiled_predicted_steps(self._predicting)) is not None:
                 return compiled
             following, fall, self._is_trial_due = self._predicting.compute_next_step(point)
-        self._record_steps("predicted tensions", following, [fall], [self._method.factor.num_factorisations - before])
+        self._record_step("predicted tensions", following, fall, self._method.factor.num_factorisations - before)
         return following
 
     def _run_compiled_predicted_steps(self, predicting: PredictedTensionNewton) -> DescentPoint | None:
-        """Return the point after compiled steps with predicted tensions; None if there are none."""
+        """Return the point after compiled steps with predicted tensions; None if they are not supported."""
         method, control, recent = self._method, self._control, np.zeros((2, _MEASURED_STEPS))
         if self._recent_steps:
             recent[:, -len(self._recent_steps) :] = np.transpose(self._recent_steps)
@@ -993,23 +993,27 @@ class MethodChoice:
             return None
         method.factor.count_factorisations(sum(found.costs))
         self._is_trial_due = found.is_trial_due
-        self._record_steps("predicted tensions", found.point, found.decreases, found.costs)
-        control.num_iterations, control.residual = len(found.costs), found.residual
+        self._record_steps("predicted tensions", found.num_moved, found.decreases, found.costs)
+        control.num_iterations, control.residual = found.num_moved, found.residual
         return found.point
 
     def _origin(self) -> DescentPoint:
         """Return the point at which the solve started."""
         return DescentPoint(self._start, self._step.gradient(self._start))
 
+    def _record_step(self, name: str, to: DescentPoint, decrease: float, num_factorisations: float) -> None:
+        """Record a Newton step to a point, as `_record_steps` does."""
+        self._record_steps(name, int(to.positions is not self._point.positions), [decrease], [num_factorisations])
+
     def _record_steps(
-        self, name: str, to: DescentPoint, decreases: Sequence[float], num_factorisations: Sequence[float]
+        self, name: str, num_moved: int, decreases: Sequence[float], num_factorisations: Sequence[float]
     ) -> None:
-        """Record the decreases per cost of Newton steps that led to a point.
+        """Record the decreases per cost of Newton steps, of which some changed the positions.
 
         They also determine when the exact method is tried next.
         """
         count, spent, recent = len(decreases), sum(num_factorisations), self._recent_steps
-        self._control.add_phase(name, count if to.positions is not self._point.positions else 0, spent)
+        self._control.add_phase(name, num_moved, spent)
         for fall, number in zip(decreases, num_factorisations, strict=True):
             if fall == 0.0:
                 recent.clear()

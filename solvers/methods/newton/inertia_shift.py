@@ -21,8 +21,11 @@ MODEL_DECREASE_FRACTION = 0.25
 """The quadratic model counts as accurate if a full step decreases the objective by this fraction of the linear
 prediction; for a quadratic function the fraction is one half."""
 
-_MIN_SHIFT, _SHIFT_RATIO = 0.1, 4.0
-"""Smallest multiple of the inertia that is added, if any, and the initial ratio of its reduction."""
+_MIN_SHIFT = 0.1
+"""Smallest multiple of the inertia that is added, if any."""
+
+FIRST_SHIFT_RATIO = 4.0
+"""Initial ratio of a reduction of the shift, and ratio of its increases."""
 
 _Found = TypeVar("_Found")
 
@@ -41,6 +44,18 @@ def reduce_shift(value: float, ratio: float, max_value: float) -> float:
 
 
 @register_jitable(**jit_inner_options)
+def increase_shift(value: float, max_value: float) -> float:
+    """Return the larger shift after one that has no factor, infinite beyond the largest finite one.
+
+    Args:
+        value: current shift.
+        max_value: largest finite shift.
+    """
+    more = max(_MIN_SHIFT, FIRST_SHIFT_RATIO * value)
+    return more if more <= max_value else np.inf
+
+
+@register_jitable(**jit_inner_options)
 def adapt_shift_ratio(value: float, ratio: float, has_factor: bool) -> float:
     """Return the ratio of the next reduction.
 
@@ -50,8 +65,8 @@ def adapt_shift_ratio(value: float, ratio: float, has_factor: bool) -> float:
         has_factor: whether the smaller shift had a factor.
     """
     if has_factor:
-        return min(_SHIFT_RATIO, ratio**2)
-    return ratio**0.5 if value < np.inf else _SHIFT_RATIO
+        return min(FIRST_SHIFT_RATIO, ratio**2)
+    return ratio**0.5 if value < np.inf else FIRST_SHIFT_RATIO
 
 
 class InertiaShift:
@@ -71,7 +86,7 @@ class InertiaShift:
             value: first multiple of the inertia; infinite to start with another modification of the Hessian.
             max_value: largest finite multiple; beyond it the value is infinite.
         """
-        self.value, self.can_reduce, self.max_value, self.ratio = value, False, max_value, _SHIFT_RATIO
+        self.value, self.can_reduce, self.max_value, self.ratio = value, False, max_value, FIRST_SHIFT_RATIO
 
     def find_smallest(self, attempt: Callable[[float], _Found | None]) -> _Found | None:
         """Return the result of the first shift that has a factor, and store that shift.
@@ -87,6 +102,5 @@ class InertiaShift:
                 self.value = less
                 return found
         while (found := attempt(self.value)) is None and self.value < np.inf:
-            self.value, self.ratio = max(_MIN_SHIFT, _SHIFT_RATIO * self.value), _SHIFT_RATIO
-            self.value = self.value if self.value <= self.max_value else np.inf
+            self.value, self.ratio = increase_shift(self.value, self.max_value), FIRST_SHIFT_RATIO
         return found

@@ -31,8 +31,8 @@ from springbench.solvers.methods.newton.predicted_tension_kernel import (
     QUADRATIC_SLOPE_RATIO,
     Relaxation,
     StepBudget,
+    project_displacement,
     run_predicted_steps,
-    try_full_step,
 )
 from springbench.solvers.model.step_problem import Positions
 from springbench.solvers.objective.step_objective import StepObjective
@@ -53,19 +53,17 @@ class CompiledNewton(NamedTuple):
     Attributes:
         arrays: arrays of the system.
         run_measured_steps: `springbench.solvers.methods.newton.newton_kernel.run_measured_steps`.
-        try_full_step: `springbench.solvers.methods.newton.predicted_tension_kernel.try_full_step`.
-        run_predicted_steps: `run_predicted_steps` of the same module.
+        run_predicted_steps: `springbench.solvers.methods.newton.predicted_tension_kernel.run_predicted_steps`.
     """
 
     arrays: NewtonArrays
     run_measured_steps: TypedKernel
-    try_full_step: TypedKernel
     run_predicted_steps: TypedKernel
 
     @classmethod
     def from_arrays(cls, arrays: NewtonArrays) -> CompiledNewton:
         """Create the kernels for the arrays of a system."""
-        return cls(arrays, *map(TypedKernel, (run_measured_steps, try_full_step, run_predicted_steps)))
+        return cls(arrays, *map(TypedKernel, (run_measured_steps, run_predicted_steps)))
 
 
 class RelaxationMethod(Protocol):
@@ -107,6 +105,7 @@ class PredictedSteps(NamedTuple):
 
     Attributes:
         point: last point.
+        num_moved: number of steps that changed the positions, all or all but the last one.
         decreases: decrease of the objective in each step [J].
         costs: factorisations in each step.
         residual: residual [J^(1/2)] at the last point, None if it is not known.
@@ -114,6 +113,7 @@ class PredictedSteps(NamedTuple):
     """
 
     point: DescentPoint
+    num_moved: int
     decreases: list[float]
     costs: list[float]
     residual: float | None
@@ -124,7 +124,7 @@ class FullStep(NamedTuple):
     """A step along the direction of a Hessian.
 
     Attributes:
-        direction: direction (n, 3) [m], valid until the next step is computed.
+        direction: direction (n, 3) [m].
         slope: derivative along it [J].
         predicted: tensions linearised for it (m,) [N].
         positions: positions at its end (n, 3) [m].
@@ -220,20 +220,23 @@ class PredictedTensionNewton:
     def run_compiled_steps(
         self, point: DescentPoint, limits: LoopLimits, budget: StepBudget, recent: NDArray[np.float64]
     ) -> PredictedSteps | None:
-        """Do steps that need no line search and no larger shift, compiled.
+        """Do steps as `compute_next_step` does them, compiled.
 
         Args:
-            point: current point; the first step starts as that of `compute_next_step`.
+            point: current point.
             limits: limits, in steps.
             budget: what ends the steps.
             recent: decrease [J] and cost of the last steps (2, k), the last one last; zero for no step; overwritten.
 
         Returns:
-            None if there are no such steps, or if they are not supported.
+            None if such steps are not supported.
         """
         compiled, step, shift = self._method.compiled_newton, self._step, self._shift
-        data = self.relaxation and self.relaxation.kernel_data
-        if compiled is None or data is None:
+        if compiled is None:
+            return None
+        if self.relaxation is None:
+            self.relaxation = self._method.start_lbfgs(step, point.positions)
+        if (data := self.relaxation.kernel_data) is None:
             return None
         relaxation = Relaxation(*data, RELAXATION_ITERATIONS, not self._method.is_very_stiff)
         progress = np.zeros(1, PREDICTED_PROGRESS_DTYPE)
@@ -242,42 +245,35 @@ class PredictedTensionNewton:
         p, gradient, (decreases, costs) = at.positions.copy(), at.gradient.copy(), np.empty((2, MAX_COMPILED_STEPS))
         fixed, tensions = (compiled.arrays, step.step_data, step.exact_pins), self._predicted_tensions
         outputs = tensions, np.empty_like(tensions), p, gradient, recent, decreases, costs, progress
-        count, residual = compiled.run_predicted_steps.call(
-            *fixed, relaxation, limits, budget, point.positions, self._first_point is not None, *outputs
+        moved, count, residual = compiled.run_predicted_steps.call(
+            *fixed, relaxation, limits, budget, point.positions, at is not point, *outputs
         )
-        if count == 0:
-            return None
         shift.value, _, shift.ratio, can_reduce, self._slope, is_trial_due = progress[0].item()
         shift.can_reduce, self._first_point = bool(can_reduce), None
-        last, known = DescentPoint(p, gradient), None if isnan(residual) else residual
-        return PredictedSteps(last, decreases[:count].tolist(), costs[:count].tolist(), known, bool(is_trial_due))
+        return PredictedSteps(
+            DescentPoint(p, gradient) if moved else point,
+            moved,
+            decreases[:count].tolist(),
+            costs[:count].tolist(),
+            None if isnan(residual) else residual,
+            bool(is_trial_due),
+        )
 
     def _try_full_step(self, at: DescentPoint, shift: float) -> FullStep | None:
         """Return the full step with a multiple of the inertia added.
 
         It is None if there is no factor. An infinite multiple drops negative transverse parts instead.
         """
-        method, step = self._method, self._step
-        keep, by = (1.0, shift) if shift < np.inf else (0.0, 0.0)
-        if (compiled := method.compiled_newton) is None:
-            added = by * method.inertia_diagonal if by > 0.0 else 0.0
-            descent = step.hessian(at.positions).factorise_and_solve(at.gradient, keep, added, self._predicted_tensions)
-            if descent is None:
-                return None
-            direction = -descent
-            slope, p = inner_product(at.gradient, direction), step.apply_exact_pins(at.positions + direction)
-            predicted = step.linearise_tensions(at.positions, direction)
-            is_sufficient = step.objective_change(at.positions, p)[0] <= MODEL_DECREASE_FRACTION * slope
-            return FullStep(direction, slope, predicted, p, step.gradient(p) if is_sufficient else None)
-        p, gradient = np.empty_like(at.positions), np.empty_like(at.positions)
-        predicted, fixed = np.empty_like(self._predicted_tensions), (compiled.arrays, step.step_data, step.exact_pins)
-        hessian, outputs = (self._predicted_tensions, keep, by), (predicted, p, gradient)
-        failed, slope, change = compiled.try_full_step.call(*fixed, *hessian, at.positions, at.gradient, *outputs)
-        step.fixed_objective.hessian_matrix.factor.count_factorisations(int(failed < 0), failed)
-        if failed >= 0:
+        step, (keep, by) = self._step, (1.0, shift) if shift < np.inf else (0.0, 0.0)
+        added = by * self._method.inertia_diagonal if by > 0.0 else 0.0
+        descent = step.hessian(at.positions).factorise_and_solve(at.gradient, keep, added, self._predicted_tensions)
+        if descent is None:
             return None
-        is_sufficient = change <= MODEL_DECREASE_FRACTION * slope
-        return FullStep(compiled.arrays.direction, slope, predicted, p, gradient if is_sufficient else None)
+        direction = -descent
+        slope, p = inner_product(at.gradient, direction), step.apply_exact_pins(at.positions + direction)
+        predicted = step.linearise_tensions(at.positions, direction)
+        is_sufficient = step.objective_change(at.positions, p)[0] <= MODEL_DECREASE_FRACTION * slope
+        return FullStep(direction, slope, predicted, p, step.gradient(p) if is_sufficient else None)
 
     def _line_search(self, at: DescentPoint, full: FullStep) -> tuple[float, DescentPoint | None, bool]:
         """Return the step size, the new point, and whether the decrease agrees with the model."""
@@ -290,7 +286,7 @@ class PredictedTensionNewton:
         found = backtracking_line_search(step, at, direction, uses_rounded_slope=True)
         if found is None:
             return 0.0, None, False
-        length = inner_product(found.positions - at.positions, direction) / inner_product(direction, direction)
+        length = project_displacement(at.positions, found.positions, direction)
         return length, self._relax_point(found.positions), False
 
     def _relax_point(self, p: Positions) -> DescentPoint:

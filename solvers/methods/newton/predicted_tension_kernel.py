@@ -5,29 +5,32 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from springbench.solvers.jit.kernel_compilation import jit_inner, jit_kernel
 from springbench.solvers.kernels.accelerated_descent import AccelerationWindow
-from springbench.solvers.kernels.descent_search import exceeds_roundoff
+from springbench.solvers.kernels.descent_search import exceeds_roundoff, move_to_trial
 from springbench.solvers.kernels.iteration_loop import REASON_ITERATIONS, RESIDUAL_EACH, check_residual
-from springbench.solvers.kernels.line_search_conditions import is_armijo_step
+from springbench.solvers.kernels.line_search_conditions import MAX_HALVINGS, is_armijo_step
 from springbench.solvers.kernels.objective_kernels import (
     change_objective,
     compute_inner_product,
     move_to_targets,
+    try_step,
     write_free_gradient,
 )
 from springbench.solvers.kernels.residual_norm import compute_residual_norm
 from springbench.solvers.kernels.spring_hessian import assemble_hessian, linearise_tensions
 from springbench.solvers.methods.newton.inertia_shift import (
+    FIRST_SHIFT_RATIO,
     MODEL_DECREASE_FRACTION,
     adapt_shift_ratio,
+    increase_shift,
     reduce_shift,
 )
-from springbench.solvers.methods.newton.newton_kernel import solve_negative
+from springbench.solvers.methods.newton.newton_kernel import NewtonArrays, solve_negative
 from springbench.solvers.methods.quasi_newton.accelerated_step import AcceleratedStep, iterate_from
 
 QUADRATIC_SLOPE_RATIO = 0.1
@@ -51,6 +54,7 @@ class Relaxation(NamedTuple):
 
     Attributes:
         step, window: data and state of L-BFGS.
+        negative_pairs: pairs of negative stiffness (k, 2), and its absolute value (k,) [N/m].
         target: inertial target (n, 3) [m].
         force: external force and constant force of the forms (n, 3) [N].
         pin_targets: target positions of the pins (q, 3) [m].
@@ -60,6 +64,7 @@ class Relaxation(NamedTuple):
 
     step: AcceleratedStep
     window: AccelerationWindow
+    negative_pairs: tuple[NDArray[np.int64], NDArray[np.float64]]
     target: NDArray[np.float64]
     force: NDArray[np.float64]
     pin_targets: NDArray[np.float64]
@@ -85,58 +90,19 @@ class StepBudget(NamedTuple):
     max_cost: float
 
 
-@jit_kernel
-def try_full_step(arrays, step_data, exact_pins, tensions, negative_fraction, shift, p, gradient, predicted, q, there):
-    """Solve for a direction, and evaluate the full step along it.
+class _PredictedState(NamedTuple):
+    """The state of a solve; the attributes are those of `run_predicted_steps`."""
 
-    Args:
-        arrays: arrays of the system; the direction is written there.
-        step_data: data of the step.
-        exact_pins: exactly pinned vertices, which are moved to their targets.
-        tensions: tensions of the springs in the Hessian (m,) [N].
-        negative_fraction: factor of the springs' negative transverse parts.
-        shift: multiple of the inertia that is added.
-        p: positions (n, 3) [m].
-        gradient: gradient there (n, 3) [N].
-        predicted: output, tensions linearised for the direction (m,) [N].
-        q: output, positions after the full step (n, 3) [m].
-        there: output, gradient there (n, 3) [N], if the decrease agrees with the quadratic model.
-
-    Returns:
-        The supernode at which the factorisation failed or -1, the slope [J], and the change of the objective [J].
-    """
-    failed = _find_direction(arrays, tensions, negative_fraction, shift, p, gradient)
-    if failed >= 0:
-        return failed, 0.0, 0.0
-    return failed, *_evaluate_full_step(arrays, step_data, exact_pins, p, gradient, predicted, q, there)
-
-
-@jit_inner
-def _find_direction(arrays, tensions, negative_fraction, shift, p, gradient):
-    """Write the direction; return the supernode at which the factorisation failed, or -1."""
-    terms, places = arrays.search.objective_terms, arrays.block_indices
-    assemble_hessian(terms, places, arrays.constant_blocks, p, tensions, negative_fraction, arrays.values)
-    if shift > 0.0:
-        for v in places.free_vertices:
-            for c in range(3):
-                arrays.values[places.diagonal_block[v], c, c] += shift * terms.inertia_diagonal[v]
-    return solve_negative(arrays, arrays.factor.schedule, gradient)
-
-
-@jit_inner
-def _evaluate_full_step(arrays, step_data, exact_pins, p, gradient, predicted, q, there):
-    """Evaluate the full step along the direction; return the slope and the change of the objective [J]."""
-    terms, form = arrays.search.objective_terms, arrays.search.quadratic_form
-    slope = compute_inner_product(gradient, arrays.direction)
-    linearise_tensions(terms, p, arrays.direction, predicted)
-    for v in range(len(p)):
-        for c in range(3):
-            q[v, c] = p[v, c] + arrays.direction[v, c]
-    move_to_targets(exact_pins, q)
-    change = change_objective(terms, form, step_data, p, q)
-    if change <= MODEL_DECREASE_FRACTION * slope:
-        write_free_gradient(terms, form, step_data, exact_pins, q, there)
-    return slope, change
+    arrays: NewtonArrays
+    step_data: Any
+    exact_pins: Any
+    relaxation: Relaxation
+    failure_costs: NDArray[np.float64]
+    tensions: NDArray[np.float64]
+    predicted: NDArray[np.float64]
+    p: NDArray[np.float64]
+    gradient: NDArray[np.float64]
+    progress: NDArray[Any]
 
 
 @jit_kernel
@@ -158,9 +124,7 @@ def run_predicted_steps(
     costs,
     progress,
 ):
-    """Run full steps, each followed by L-BFGS iterations unless its decrease agrees with the quadratic model.
-
-    They end before a step that needs a line search or a larger shift.
+    """Run steps of Newton's method with predicted tensions, up to one that does not decrease the objective.
 
     Args:
         arrays: arrays of the system.
@@ -176,111 +140,170 @@ def run_predicted_steps(
         p: positions (n, 3) [m], updated.
         gradient: gradient there (n, 3) [N], updated.
         recent: decrease [J] and cost of the last steps, the last one last (2, k); updated, zero for no step.
-        decreases: output, decrease of the objective in each step [J]; its length limits their number.
+        decreases: output, decrease of the objective in each step [J], zero in the last one if the positions did not
+            change; its length limits their number.
         costs: output, factorisations in each step.
         progress: progress of the solve (1,), updated.
 
     Returns:
-        Number of steps, and the last residual [J^(1/2)] or NaN.
+        Number of steps that changed the positions, number of all steps, and the last residual [J^(1/2)] or NaN.
     """
+    state = _PredictedState(
+        arrays, step_data, exact_pins, relaxation, budget.failure_costs, tensions, predicted, p, gradient, progress
+    )
     now, count, spent, residual, ended = progress[0], 0, budget.spent, np.nan, REASON_ITERATIONS
     while count < min(limits.max_iterations, len(decreases)) and ended == REASON_ITERATIONS:
-        fall, cost = _take_step(
-            arrays,
-            step_data,
-            exact_pins,
-            relaxation,
-            budget,
-            compared,
-            is_compared and count == 0,
-            tensions,
-            predicted,
-            p,
-            gradient,
-            now,
-        )
-        if not fall > 0.0:
-            break
-        decreases[count], costs[count] = fall, cost
-        count += 1
+        decreases[count], costs[count] = _take_step(state, compared, is_compared and count == 0)
+        if decreases[count] == 0.0:
+            return count, count + 1, residual
         if limits.residual_mode == RESIDUAL_EACH:
             residual = compute_residual_norm(arrays.search.residual_norm, gradient)
             ended = check_residual(residual, limits)
-        cost *= budget.newton_cost
-        spent += cost
-        if now.is_trial_due == 1 or spent >= budget.max_cost or not _add_recent(recent, fall, cost) > budget.min_gain:
+        cost = budget.newton_cost * costs[count]
+        gain, spent, count = _add_recent(recent, decreases[count], cost), spent + cost, count + 1
+        if now.is_trial_due == 1 or spent >= budget.max_cost or gain <= budget.min_gain:
             break
-    return count, residual
+    return count, count, residual
 
 
 @jit_inner
-def _add_recent(recent, fall, cost):
+def _add_recent(recent, decrease, cost):
     """Add a step to the last ones, and return their decrease per cost [J]."""
     last = recent.shape[1] - 1
     for k in range(last):
         recent[0, k], recent[1, k] = recent[0, k + 1], recent[1, k + 1]
-    recent[0, last], recent[1, last] = fall, cost
+    recent[0, last], recent[1, last] = decrease, cost
     return recent[0].sum() / recent[1].sum()
 
 
 @jit_inner
-def _take_step(
-    arrays, step_data, exact_pins, relaxation, budget, compared, is_compared, tensions, predicted, p, gradient, now
-):
-    """Do a step if it needs no line search and no larger shift.
-
-    Return the decrease of the objective [J], zero for no step, and the factorisations made.
-    """
-    search, is_smaller = arrays.search, now.can_reduce == 1 and now.shift > 0.0
-    q, there = search.trial_positions, search.trial_gradient
-    shift, ratio, cost = now.shift, now.shift_ratio, 1.0
-    if is_smaller:
-        shift = reduce_shift(now.shift, ratio, now.max_shift)
-    failed = _find_shifted_direction(arrays, tensions, shift, p, gradient)
-    if is_smaller:
-        ratio = adapt_shift_ratio(now.shift, ratio, failed < 0)
-        if failed >= 0:
-            shift, cost = now.shift, cost + budget.failure_costs[failed]
-            failed = _find_shifted_direction(arrays, tensions, shift, p, gradient)
-    if failed >= 0:
+def _take_step(state, compared, is_compared):
+    """Do a step; return the decrease of the objective [J], zero for no step, and the factorisations made."""
+    now, search, d, length = state.progress[0], state.arrays.search, state.arrays.direction, 1.0
+    p, gradient, q, there = state.p, state.gradient, search.trial_positions, search.trial_gradient
+    terms, tensions = (search.objective_terms, search.quadratic_form, state.step_data), state.tensions
+    before, is_found, cost = now.slope, *_find_direction(state)
+    now.is_trial_due = 1
+    if not is_found:
         return 0.0, cost
-    slope, change = _evaluate_full_step(arrays, step_data, exact_pins, p, gradient, predicted, q, there)
+    now.slope = slope = compute_inner_product(gradient, d)
     if not exceeds_roundoff(search, p, -slope):
         return 0.0, cost
-    is_sufficient = change <= MODEL_DECREASE_FRACTION * slope
-    if not is_sufficient:
-        _relax_positions(arrays, step_data, exact_pins, relaxation, q, there)
-        change = change_objective(search.objective_terms, search.quadratic_form, step_data, p, q)
-        if not is_armijo_step(change, 1.0, slope, 0.0):
-            return 0.0, cost
-    if is_compared:
-        change = change_objective(search.objective_terms, search.quadratic_form, step_data, compared, q)
-    if not change < 0.0:
-        return 0.0, cost
+    linearise_tensions(search.objective_terms, p, d, state.predicted)
     for v in range(len(p)):
         for c in range(3):
-            p[v, c], gradient[v, c] = q[v, c], there[v, c]
+            q[v, c] = p[v, c] + d[v, c]
+    move_to_targets(state.exact_pins, q)
+    change = change_objective(*terms, p, q)
+    is_sufficient = change <= MODEL_DECREASE_FRACTION * slope
+    if is_sufficient:
+        write_free_gradient(*terms, state.exact_pins, q, there)
+    else:
+        _relax_positions(state)
+        change = change_objective(*terms, p, q)
+        if not is_armijo_step(change, 1.0, slope, 0.0):
+            if not _search_rounded(state, slope):
+                return 0.0, cost
+            length = project_displacement(p, q, d)
+            _relax_positions(state)
+            change = change_objective(*terms, p, q)
+    now.can_reduce = is_sufficient or now.shift == np.inf
     for e in range(len(tensions)):
-        tensions[e] += 1.0 * (predicted[e] - tensions[e])
-    now.is_trial_due = shift == 0.0 and is_sufficient and slope >= QUADRATIC_SLOPE_RATIO * now.slope
-    now.shift, now.shift_ratio, now.slope = shift, ratio, slope
-    now.can_reduce = is_sufficient or shift == np.inf
+        tensions[e] += length * (state.predicted[e] - tensions[e])
+    if is_compared:
+        change = change_objective(*terms, compared, q)
+    if not change < 0.0:
+        now.is_trial_due = not is_compared
+        return 0.0, cost
+    now.is_trial_due = now.shift == 0.0 and is_sufficient and slope >= QUADRATIC_SLOPE_RATIO * before
+    move_to_trial(search, p, gradient)
     return -change, cost
 
 
 @jit_inner
-def _find_shifted_direction(arrays, tensions, shift, p, gradient):
-    """Write the direction; an infinite shift drops negative transverse parts instead."""
-    if shift < np.inf:
-        return _find_direction(arrays, tensions, 1.0, shift, p, gradient)
-    return _find_direction(arrays, tensions, 0.0, 0.0, p, gradient)
+def _find_direction(state):
+    """Find the direction for the smallest shift that has a factor, as `InertiaShift` does.
+
+    Return whether there is one, and the factorisations made.
+    """
+    now, failure_costs, cost = state.progress[0], state.failure_costs, 1.0
+    if now.can_reduce == 1 and now.shift > 0.0:
+        less = reduce_shift(now.shift, now.shift_ratio, now.max_shift)
+        failed = _solve_shifted(state, less)
+        now.shift_ratio = adapt_shift_ratio(now.shift, now.shift_ratio, failed < 0)
+        if failed < 0:
+            now.shift = less
+            return True, cost
+        cost += failure_costs[failed]
+    failed = _solve_shifted(state, now.shift)
+    while failed >= 0 and now.shift < np.inf:
+        cost += failure_costs[failed]
+        now.shift, now.shift_ratio = increase_shift(now.shift, now.max_shift), FIRST_SHIFT_RATIO
+        failed = _solve_shifted(state, now.shift)
+    if failed >= 0:
+        return False, cost - 1.0 + failure_costs[failed]
+    return True, cost
 
 
 @jit_inner
-def _relax_positions(arrays, step_data, exact_pins, relaxation, q, there):
-    """Do the L-BFGS iterations from q, and write the positions and the gradient at their end."""
-    step, window, target, force, pin_targets, num_iterations, uses_own_gradient = relaxation
-    iterate_from(step, window, target, force, pin_targets, num_iterations, q, there)
-    if not uses_own_gradient:
-        terms, form = arrays.search.objective_terms, arrays.search.quadratic_form
-        write_free_gradient(terms, form, step_data, exact_pins, q, there)
+def _solve_shifted(state, shift):
+    """Write the direction; return the supernode at which the factorisation failed, or -1.
+
+    An infinite shift drops negative transverse parts instead.
+    """
+    arrays, is_finite = state.arrays, shift < np.inf
+    terms, places, negative_fraction = arrays.search.objective_terms, arrays.block_indices, 1.0 if is_finite else 0.0
+    assemble_hessian(terms, places, arrays.constant_blocks, state.p, state.tensions, negative_fraction, arrays.values)
+    if is_finite and shift > 0.0:
+        for v in places.free_vertices:
+            for c in range(3):
+                arrays.values[places.diagonal_block[v], c, c] += shift * terms.inertia_diagonal[v]
+    return solve_negative(arrays, arrays.factor.schedule, state.gradient)
+
+
+@jit_inner
+def _relax_positions(state):
+    """Do the L-BFGS iterations from the trial point, and write the trial point at their end."""
+    search, r = state.arrays.search, state.relaxation
+    q, there = search.trial_positions, search.trial_gradient
+    iterate_from(r.step, r.window, r.negative_pairs, r.target, r.force, r.pin_targets, r.num_iterations, q, there)
+    if not r.uses_own_gradient:
+        write_free_gradient(search.objective_terms, search.quadratic_form, state.step_data, state.exact_pins, q, there)
+
+
+@jit_inner
+def _search_rounded(state, slope):
+    """Find the first of the step sizes 1, 1/2, ... at which the objective decreases enough.
+
+    A decrease is also sufficient for the slope along the rounded displacement. Return whether there is one.
+    """
+    search, step_size, p, gradient = state.arrays.search, 1.0, state.p, state.gradient
+    terms = search.objective_terms, search.quadratic_form, state.step_data, state.exact_pins
+    q, there, d = search.trial_positions, search.trial_gradient, state.arrays.direction
+    for _ in range(MAX_HALVINGS if slope < 0.0 else 0):
+        change, is_sufficient = try_step(*terms, p, d, step_size, slope, 0.0, q, there)
+        if not is_sufficient and change < 0.0:
+            rounded_slope = 0.0
+            for v in range(len(p)):
+                for c in range(3):
+                    rounded_slope += gradient[v, c] * (q[v, c] - p[v, c])
+            is_sufficient = rounded_slope < 0.0 and is_armijo_step(change, 1.0, rounded_slope, 0.0)
+        if is_sufficient:
+            return True
+        step_size *= 0.5
+    return False
+
+
+@jit_kernel
+def project_displacement(p, q, d):
+    """Return the displacement from p to q along d, as a multiple of d.
+
+    Args:
+        p, q: positions (n, 3) [m].
+        d: direction (n, 3) [m].
+    """
+    product = 0.0
+    for v in range(len(p)):
+        for c in range(3):
+            product += (q[v, c] - p[v, c]) * d[v, c]
+    return product / compute_inner_product(d, d)

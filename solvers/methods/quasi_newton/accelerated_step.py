@@ -21,6 +21,7 @@ from springbench.solvers.kernels.accelerated_descent import (
     init_window,
     propose_trial,
 )
+from springbench.solvers.kernels.edge_elements import sum_squared_stretch
 from springbench.solvers.kernels.iteration_loop import build_compiled_loop
 from springbench.solvers.kernels.local_global_iteration import IterationPlan
 from springbench.solvers.kernels.objective_kernels import predict_positions
@@ -77,12 +78,13 @@ def start_solve(step: AcceleratedStep, window: AccelerationWindow, target, force
 
 
 @jit_inner
-def iterate_from(step, window, target, force, pin_targets, num_iterations, p, gradient):
+def iterate_from(step, window, negative_pairs, target, force, pin_targets, num_iterations, p, gradient):
     """Do iterations from positions, at most up to the first that finds no descent.
 
     Args:
         step: data of the system; its vectors and objective values are overwritten.
         window: state of the solve, initialised at the positions.
+        negative_pairs: pairs of negative stiffness (k, 2), and its absolute value (k,) [N/m].
         target: inertial target (n, 3) [m].
         force: external force and constant force of the forms (n, 3) [N].
         pin_targets: target positions of the pins (q, 3) [m].
@@ -92,6 +94,7 @@ def iterate_from(step, window, target, force, pin_targets, num_iterations, p, gr
     """
     _evaluate_guess(step, window, target, force, pin_targets, p)
     _start_window(step, window)
+    step.objective_values[2] = 0.5 * sum_squared_stretch(*negative_pairs, p)
     for _ in range(num_iterations):
         if not step_state((step, window)):
             break

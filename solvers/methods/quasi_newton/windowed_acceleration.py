@@ -280,13 +280,13 @@ class CompiledAccelerationState(CompiledState, AcceleratedState):
         return self.start_at_guess()
 
     @property
-    def kernel_data(self) -> tuple[Any, Any, Any, Any, Any] | None:
-        """Data and state of the solve, inertial target, force and pin targets, as in `accelerated_step.iterate_from`.
+    def kernel_data(self) -> tuple[Any, ...] | None:
+        """Arguments of `accelerated_step.iterate_from` before the number of iterations.
 
-        It is None for energies with scales of cancellation, which are not computed in kernels.
+        It is None with strain limits or dashpots, whose scales of cancellation are not computed there.
         """
-        target, force, pin_targets, _ = self._step_arrays
-        return None if self._engine.has_energy_scales else (*self._state, target, force, pin_targets)
+        parts, (target, force, pin_targets, _) = self._engine.spring_form, self._step_arrays
+        return None if parts.has_edges else (*self._state, parts.negative_pairs, target, force, pin_targets)
 
     def _add_energy_scales(self, p: Positions) -> None:
         """Add the scales of cancellation in forms and edges at the start p (n, 3) [m]."""
