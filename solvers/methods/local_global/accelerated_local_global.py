@@ -56,7 +56,7 @@ class AcceleratedState(SolverState):
         """Return the gradient of the objective [N], (n, 3), at the iterate."""
 
     @property
-    def kernel_data(self) -> tuple[Any, ...] | None:
+    def kernel_data(self) -> tuple[Any, Any, Any, Any, Any, Any] | None:
         """Data for kernels that continue with iterations of the solve; None if the iterations are not compiled."""
         return None
 

@@ -280,7 +280,7 @@ class CompiledAccelerationState(CompiledState, AcceleratedState):
         return self.start_at_guess()
 
     @property
-    def kernel_data(self) -> tuple[Any, ...] | None:
+    def kernel_data(self) -> tuple[Any, Any, Any, Any, Any, Any] | None:
         """Arguments of `accelerated_step.iterate_from` before the number of iterations.
 
         It is None with strain limits or dashpots, whose scales of cancellation are not computed there.
