@@ -32,6 +32,8 @@ from springbench.solvers.jit.kernel_compilation import jit_closure, jit_inner_op
 from springbench.solvers.kernels.iteration_loop import (
     REASON_ITERATIONS,
     REASON_STALLED,
+    RESIDUAL_EACH,
+    RESIDUAL_LAST,
     LoopLimits,
     build_unchecked_steps,
     check_residual,
@@ -161,8 +163,8 @@ def build_rounds(
     Returns:
         A function (state, rounds, limits), `rounds` of `ROUND_STATE_DTYPE` (1,) and limits in rounds. It returns the
         number of rounds, the last residual and the termination reason. Without a limit of the residual, it is computed
-        only where a decision needs it, and by a call for no rounds; else it is nan. The floor of the limits and that of
-        the rounds end the loop.
+        only where a decision needs it, after the last round if the mode is RESIDUAL_LAST, and by a call for no rounds;
+        else it is nan. The floor of the limits and that of the rounds end the loop.
     """
 
     def iterate(state: Any, rounds: Any, limits: Any) -> Any:
@@ -170,7 +172,8 @@ def build_rounds(
         if limits.max_iterations == 0:
             return 0, residual(state, np.inf), REASON_ITERATIONS
         floor = max(limits.residual_floor, now.residual_floor)
-        limits = LoopLimits(limits.max_iterations, limits.residual_limit, floor, limits.residual_mode)
+        needs_last = limits.residual_mode == RESIDUAL_LAST
+        limits = LoopLimits(limits.max_iterations, limits.residual_limit, floor, RESIDUAL_EACH)
         exact_below = 2.0 * max(limits.residual_limit, floor)
         if now.initial_residual < 0.0:
             now.initial_residual = now.group_residual = now.segment_residual = residual(state, exact_below)
@@ -196,6 +199,8 @@ def build_rounds(
                 now.late_start, now.late_decrease = now.num_iterations, total
             if ended == REASON_ITERATIONS:
                 ended = _assess_round(now, total, found, limits.residual_limit) if is_done else REASON_STALLED
+        if needs_last and np.isnan(found):
+            found = residual(state, np.inf)
         return count, found, ended
 
     return iterate

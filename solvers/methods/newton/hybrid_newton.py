@@ -14,12 +14,13 @@ one is added: along unstable directions the step is longer, the closer that mult
 Sorensen 1983).
 
 L-BFGS runs first. If the factor of Q exceeds the cache, it is in float32, unless Q is so stiff that its directions
-would have no digit: the iterations are then limited by memory bandwidth, and directions need no more digits. The start
-is the better of the initial guess and the inertial prediction. Near the minimum, where an iteration of L-BFGS decreases
-the objective by at most 5e-5 of the decrease so far, groups of its iterations alternate with rounds of sweeps of vertex
-block descent (`springbench.solvers.methods.quasi_newton.sweep_rounds`). More rounds of sweeps follow as long as each
-reduces the residual to 0.56 of it. The sweeps come first if no diagonal entry of Q exceeds 500 times the inertia; there
-are none if one exceeds the inertia over the square root of the machine epsilon.
+would have no digit: the iterations are then limited by memory bandwidth, and directions need no more digits. If the
+initial guess are the current positions, the start is the better of these and the inertial prediction. Near the minimum,
+where an iteration of L-BFGS decreases the objective by at most 5e-5 of the decrease so far, groups of its iterations
+alternate with rounds of sweeps of vertex block descent (`springbench.solvers.methods.quasi_newton.sweep_rounds`). More
+rounds of sweeps follow as long as each reduces the residual to 0.56 of it. The sweeps come first if no diagonal entry
+of Q exceeds 500 times the inertia; there are none if one exceeds the inertia over the square root of the machine
+epsilon.
 
 One rule decides which of the three methods continues: that with the largest decrease of the objective per cost in its
 last steps. A method that was not yet measured is credited with the decrease that L-BFGS leaves, extrapolated from its
@@ -144,9 +145,6 @@ _SWEEP_FIRST_RATIO = 500.0
 """Largest ratio of the diagonal of Q to the inertia at which a solve starts with sweeps: Chebyshev's iteration then
 divides the objective by ten in about as many sweeps as a group has iterations."""
 
-ONE_ROUND = LoopLimits(1, 0.0, 0.0, RESIDUAL_EACH)
-"""The limits of rounds for `ONE_ITERATION`."""
-
 _ROUND_END_COST, _COLLISION_CHECK_COST = 0.1, 20.0
 """Costs of the end of a round and of a check for collisions, in iterations of L-BFGS: 0.01 to 0.4 for a call of the
 compiled rounds on 28 scenes of 81 to 16384 vertices, and 10 to 100 on folded cloths of 85 to 396 vertices."""
@@ -223,7 +221,7 @@ class PreparedHybrid(PreparedDescent):
             problem: step whose objective is minimised.
             initial_guess: positions (n, 3) [m], not modified.
         """
-        return (LbfgsFirstState if self.method.starts_lower else HybridState)(self, problem, initial_guess)
+        return (LbfgsFirstState if self.method.starts_with_lbfgs else HybridState)(self, problem, initial_guess)
 
     def residual_at(self, problem: StepProblem, p: Positions) -> float:
         """Return the residual [J^(1/2)], by L-BFGS if its residuals are those of the metric.
@@ -385,7 +383,7 @@ class LbfgsFirstState(HybridState):
     """
 
     _run: LbfgsSweepState | None = None
-    _limits, _round_limits = ONE_ITERATION, ONE_ROUND  # the last ones, and those of rounds
+    _limits = _round_limits = ONE_ITERATION  # the last ones, and those of rounds
     _num_rounds = 0
     _is_lbfgs_alone = True
 
@@ -401,7 +399,7 @@ class LbfgsFirstState(HybridState):
     def _prepare_run(self) -> LbfgsSweepState:
         """Prepare L-BFGS, which the first rounds start."""
         method = self._prepared.method
-        run = self._run = method.prepare_lower_start(self._problem, self.positions)
+        run = self._run = method.prepare_lbfgs(self._problem, self.positions)
         self._rounds = method.init_rounds()
         return run
 
@@ -469,7 +467,7 @@ class LbfgsFirstState(HybridState):
 def limit_rounds(limits: LoopLimits) -> LoopLimits:
     """Return the limits of rounds of a solve with these limits."""
     limit = limits.residual_limit if limits.residual_mode == RESIDUAL_EACH else 0.0
-    return LoopLimits(limits.max_iterations, limit, limits.residual_floor, RESIDUAL_EACH)
+    return limits._replace(residual_limit=limit)
 
 
 class MeasuredRule(ShiftScheduleRule):
@@ -589,7 +587,7 @@ class HybridIteration:
         factor: factor of the Hessian.
         exact_lbfgs: L-BFGS, if its residuals are those of the metric; else None.
         is_very_stiff: whether the gradients of L-BFGS have too much round-off (`_MAX_EXACT_RATIO`).
-        starts_lower: whether L-BFGS itself starts at the lower one of the initial guess and the inertial prediction.
+        starts_with_lbfgs: whether a solve starts with compiled rounds of L-BFGS, which choose where to start.
         newton_cost: cost of a Newton step, in groups of L-BFGS iterations.
         sweep_cost: cost of a round of sweeps, in L-BFGS iterations; 0 if there are none.
         starts_sweeping: whether a solve starts with sweeps.
@@ -614,7 +612,7 @@ class HybridIteration:
         is_projective = objective.projective_indices.issuperset(objective.element_energy_indices)
         engine = lbfgs.acceleration_engine
         self._sweep_engine = engine if isinstance(engine, LbfgsSweepEngine) else None
-        self.starts_lower = has_exact_gradients and is_projective and self._sweep_engine is not None
+        self.starts_with_lbfgs = has_exact_gradients and is_projective and self._sweep_engine is not None
         springs, entries = len(objective.springs.stiffness), lbfgs.stats.get("nnz_factor", 0.0)
         constant, per_vertex, per_entry = _LBFGS_NANOSECONDS
         lbfgs_cost = constant + per_vertex * objective.system.num_vertices + per_entry * entries
@@ -662,10 +660,13 @@ class HybridIteration:
 
         Args:
             step: objective of the step.
-            p: positions (n, 3) [m]; the inertial prediction replaces them if it is lower.
+            p: positions (n, 3) [m]; if the step's guess are its current positions, the inertial prediction replaces
+                them if it is lower.
             control: limits of the next iterations, read for each point; counts and costs are recorded there.
         """
-        yield from self.continue_from(step, DescentPoint(lower_start_positions(step, p), NO_GRADIENT), control)
+        if step.problem.initial_guess is step.problem.current_positions:
+            p = lower_start_positions(step, p)
+        yield from self.continue_from(step, DescentPoint(p, NO_GRADIENT), control)
 
     def continue_from(
         self, step: StepObjective, start: DescentPoint, control: SolveControl, method_choice: MethodChoice | None = None
@@ -713,17 +714,15 @@ class HybridIteration:
         """
         return self._lbfgs.init_state(self._without_barriers(step.problem), p)
 
-    def prepare_lower_start(self, problem: StepProblem, guess: Positions) -> LbfgsSweepState:
-        """Prepare L-BFGS, if `starts_lower`.
-
-        It starts at the lower one of the guess and the inertial prediction.
+    def prepare_lbfgs(self, problem: StepProblem, guess: Positions) -> LbfgsSweepState:
+        """Prepare L-BFGS, if `starts_with_lbfgs`; it chooses where it starts.
 
         Args:
             problem: step whose objective is minimised.
             guess: initial guess (n, 3) [m].
         """
         assert self._sweep_engine is not None
-        return self._sweep_engine.init_lower_state(self._without_barriers(problem), guess)
+        return self._sweep_engine.prepare_state(self._without_barriers(problem), guess)
 
     def _without_barriers(self, problem: StepProblem) -> StepProblem:
         return ignore_barriers(problem) if self._system_has_barriers else problem

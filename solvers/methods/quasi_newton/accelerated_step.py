@@ -106,8 +106,10 @@ def iterate_from(step, window, negative_pairs, target, force, pin_targets, num_i
 
 
 @jit_inner
-def start_lower_solve(step, window, target, force, pin_targets, guess, external_force, measures_guess, out):
-    """Start the solve at the lower of a guess and the inertial prediction.
+def start_lower_solve(
+    step, window, target, force, pin_targets, guess, external_force, compares_prediction, measures_guess, out
+):
+    """Start the solve at a guess, or at the lower one of the guess and the inertial prediction.
 
     Args:
         step: data of the system; its vectors and objective values are overwritten.
@@ -117,6 +119,7 @@ def start_lower_solve(step, window, target, force, pin_targets, guess, external_
         pin_targets: target positions of the pins (q, 3) [m].
         guess: initial guess (n, 3) [m].
         external_force: force of the inertial prediction (n, 3) [N].
+        compares_prediction: whether the inertial prediction is compared.
         measures_guess: whether the residual at the guess is computed.
         out: output (n, 3) [m], the positions at the start.
 
@@ -128,20 +131,22 @@ def start_lower_solve(step, window, target, force, pin_targets, guess, external_
     if measures_guess:
         _start_window(step, window)
         at_guess = compute_window_residual((step, window))
-    for k in range(size):
-        window.position[k], window.descent[k] = window.trial_position[k], window.trial_descent[k]
-    predict_positions(rows.inertia_diagonal, target, external_force, rows.pinned_vertices, pin_targets, out)
-    write_positions(rows, out, pin_targets, window.trial_position)
     is_lower = False
-    if _differs(window.trial_position, window.position, size):
-        there = evaluate_trial(step, window)
-        is_lower = there < step.objective_values[0]
-        if is_lower:
-            step.objective_values[0] = there
-        else:
-            for k in range(size):
-                window.trial_position[k], window.trial_descent[k] = window.position[k], window.descent[k]
-            read_positions(rows, window.trial_position, out)
+    if compares_prediction:
+        for k in range(size):
+            window.position[k], window.descent[k] = window.trial_position[k], window.trial_descent[k]
+        predict_positions(rows.inertia_diagonal, target, external_force, rows.pinned_vertices, pin_targets, out)
+        write_positions(rows, out, pin_targets, window.trial_position)
+        if _differs(window.trial_position, window.position, size):
+            there = evaluate_trial(step, window)
+            is_lower = there < step.objective_values[0]
+            if is_lower:
+                step.objective_values[0] = there
+            else:
+                for k in range(size):
+                    window.trial_position[k], window.trial_descent[k] = window.position[k], window.descent[k]
+    if not is_lower:
+        read_positions(rows, window.trial_position, out)
     if is_lower or not measures_guess:
         _start_window(step, window)
     return at_guess

@@ -16,8 +16,9 @@ from springbench.solvers.methods.local_global.fused_local_global import Prepared
 from springbench.solvers.methods.quasi_newton.sweep_rounds import (
     CONTINUES,
     NOT_STARTED,
-    STARTS,
-    STARTS_MEASURED,
+    STARTS_AT_GUESS,
+    STARTS_LOWER,
+    STARTS_LOWER_MEASURED,
     StepArrays,
     SweepStep,
     run_sweep_rounds,
@@ -56,10 +57,11 @@ class LbfgsSweepEngine(CompiledEngine):
         """
         return LbfgsSweepState(self, problem, initial_guess).start_at_guess()
 
-    def init_lower_state(self, problem: StepProblem, initial_guess: Positions) -> LbfgsSweepState:
+    def prepare_state(self, problem: StepProblem, initial_guess: Positions) -> LbfgsSweepState:
         """Prepare a solve, which its first rounds start.
 
-        It starts at the lower one of a guess and the inertial prediction.
+        If the step's guess are its current positions, it starts at the lower one of a guess and the inertial
+        prediction.
 
         Args:
             problem: step whose objective is minimised.
@@ -94,7 +96,8 @@ class LbfgsSweepState(CompiledAccelerationState):
         self.start_positions = np.empty(guess.shape)
         arrays = StepArrays(*self._step_arrays, self._external_force, self.start_positions, self.positions)
         self._round_arguments = *self._state, sweeps, arrays
-        self._round_kernel, self._trace, self._start_kind = engine.round_kernel, engine.unpinned_trace, STARTS
+        self._round_kernel, self._trace = engine.round_kernel, engine.unpinned_trace
+        self._start_kind = STARTS_LOWER if problem.initial_guess is problem.current_positions else STARTS_AT_GUESS
 
     def start_at_guess(self) -> Self:
         """Start the solve at the initial guess; return the state."""
@@ -111,9 +114,9 @@ class LbfgsSweepState(CompiledAccelerationState):
         Returns:
             The residual at the guess [J^(1/2)].
         """
-        return self._start_lower(rounds, STARTS_MEASURED)
+        return self._start_solve(rounds, STARTS_LOWER_MEASURED)
 
-    def _start_lower(self, rounds: NDArray[Any], start: int) -> float:
+    def _start_solve(self, rounds: NDArray[Any], start: int) -> float:
         """Start the solve without rounds; return the residual at the guess [J^(1/2)] or NaN."""
         self._start_kind = CONTINUES
         residual = self._round_kernel.call(*self._round_arguments, start, self._trace, rounds, NO_ITERATIONS)[3]
@@ -128,6 +131,6 @@ class LbfgsSweepState(CompiledAccelerationState):
             limits: limits, in rounds.
         """
         if self._start_kind != CONTINUES and self._engine.has_energy_scales:
-            self._start_lower(rounds, STARTS)
+            self._start_solve(rounds, self._start_kind)
         start, self._start_kind = self._start_kind, CONTINUES
         return self._round_kernel.call(*self._round_arguments, start, self._trace, rounds, limits)[:3]

@@ -40,8 +40,9 @@ ROUND_SWEEPS = 5
 NOT_STARTED, MOVED = -2.0, -1.0
 """Chebyshev factors before the first sweeps of a solve, and before those after an iteration of L-BFGS."""
 
-CONTINUES, STARTS, STARTS_MEASURED = range(3)
-"""Whether rounds continue a solve or start it, and then measure the residual at the initial guess."""
+CONTINUES, STARTS_AT_GUESS, STARTS_LOWER, STARTS_LOWER_MEASURED = range(4)
+"""Whether rounds continue a solve or start it: at the initial guess, or at the lower one of the guess and the inertial
+prediction, without or with the residual at the guess."""
 
 
 class SweepStep(NamedTuple):
@@ -183,8 +184,7 @@ def run_sweep_rounds(
         window: state of the solve, updated.
         sweeps: data of the sweeps; its arrays of the solve are updated.
         arrays: arrays of the solve.
-        start: CONTINUES, STARTS or STARTS_MEASURED: whether the solve starts first, at the lower one of the guess and
-            the inertial prediction, and whether the residual at the guess is computed.
+        start: CONTINUES or how the solve starts first: STARTS_AT_GUESS, STARTS_LOWER or STARTS_LOWER_MEASURED.
         unpinned_trace: sum of the diagonal of Q over the unpinned vertices [N/m], for the residual's round-off.
         rounds: state of the rounds (1,) of type ROUND_STATE_DTYPE, updated.
         limits: limits of the loop, in rounds. A start without rounds does not compute the last residual.
@@ -203,7 +203,8 @@ def run_sweep_rounds(
             arrays.pin_targets,
             arrays.guess,
             arrays.external_force,
-            start == STARTS_MEASURED,
+            start != STARTS_AT_GUESS,
+            start == STARTS_LOWER_MEASURED,
             arrays.start,
         )
         rounds[0].residual_floor = EPS * compute_max_magnitude(arrays.start) * np.sqrt(unpinned_trace)
