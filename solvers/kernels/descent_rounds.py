@@ -189,9 +189,9 @@ def build_rounds(
             total = decrease(state)
             ends_segment = now.sweep_cost > 0 and (now.is_sweeping == 1 or now.num_iterations >= now.segment_end)
             is_assessed = now.num_iterations == PROBE_ITERATIONS or now.num_iterations >= now.group_end
-            found = np.nan
-            if limits.residual_limit > 0.0 or ends_segment or is_assessed or not is_done:
-                found = residual(state, exact_below)
+            is_last, found = needs_last and count == limits.max_iterations, np.nan
+            if limits.residual_limit > 0.0 or ends_segment or is_assessed or is_last or not is_done:
+                found = residual(state, np.inf if is_last else exact_below)
                 ended = check_residual(found, limits)
             if ends_segment:
                 _choose_sweeps(now, total, found)
@@ -199,8 +199,6 @@ def build_rounds(
                 now.late_start, now.late_decrease = now.num_iterations, total
             if ended == REASON_ITERATIONS:
                 ended = _assess_round(now, total, found, limits.residual_limit) if is_done else REASON_STALLED
-        if needs_last and np.isnan(found):
-            found = residual(state, np.inf)
         return count, found, ended
 
     return iterate
