@@ -135,16 +135,13 @@ def test_the_first_group_of_iterations_is_that_of_lbfgs(guess, monkeypatch):
 
 
 def sweep_with_restarts(given: StepProblem, p: Positions, num_sweeps: int) -> Positions:
-    """Sweeps with Chebyshev's extrapolation, which restarts where a sweep turns against the last movement."""
+    """Sweeps with Nesterov's extrapolation, which restarts where a sweep turns against the last movement."""
     descent = VertexBlockDescent(spectral_radius=0.0).prepare(given.system)
-    radius, omega, older = VertexBlockDescent().spectral_radius, 0.0, p
+    extrapolated, count = p, 0
     for _ in range(num_sweeps):
-        swept = descent.solve(replace(given, initial_guess=p), StopRule(1)).positions
-        weights = {0.0: 1.0, 1.0: 2.0 / (2.0 - radius**2)}
-        omega = weights.get(omega, 4.0 / (4.0 - radius**2 * omega))
-        if np.sum((swept - p) * (p - older)) < 0.0:
-            omega = 0.0
-        p, older = older + omega * (swept - older) if omega > 1.0 else swept, p
+        before, p = p, descent.solve(replace(given, initial_guess=extrapolated), StopRule(1)).positions
+        count = count + 1 if np.sum((p - extrapolated) * (p - before)) >= 0.0 else 0
+        extrapolated = p + count / (count + 1) * (p - before)
     return p
 
 

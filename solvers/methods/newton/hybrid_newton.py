@@ -509,7 +509,7 @@ class MeasuredRule(ShiftScheduleRule):
         Returns:
             0 if nothing was added, more for other factors, None for no factor.
         """
-        self.agrees_with_model, self.decrease, self._before = False, None, self._factor.num_factorisations
+        self.agrees_with_model, self.decrease = False, None
         self._name = max(self._gains, key=lambda name: self._gains[name])
         if self.has_factor:
             self._level = 0
@@ -521,6 +521,14 @@ class MeasuredRule(ShiftScheduleRule):
             self._level = self._shift.find_smallest(lambda shift: self._factorise_shifted(hessian, diagonal, shift))
         self.has_factor = None
         return self._level
+
+    def begin_step(self, *, is_exact_only: bool) -> None:
+        """Begin a step, before its first factorisation.
+
+        Args:
+            is_exact_only: whether only the unmodified Hessian may be factorised.
+        """
+        self.is_exact_only, self._before = is_exact_only, self._factor.num_factorisations
 
     @property
     def tries_exact_first(self) -> bool:
@@ -918,7 +926,7 @@ class MethodChoice:
         time, L-BFGS has often not yet reached a convex region, and the next attempt comes sooner.
         """
         method, rule, before = self._method, self._rule, self._method.factor.num_factorisations
-        rule.is_exact_only = self._predicting is None and any(self._gains.values())
+        rule.begin_step(is_exact_only=self._predicting is None and any(self._gains.values()))
         if method.compiled_newton is not None and rule.tries_exact_first:
             point = self._run_compiled_steps(method.compiled_newton)
             if point is not self._point:

@@ -43,9 +43,9 @@ class LbfgsSweepEngine(CompiledEngine):
             compiled: local-global method of the system, whose energies are compiled.
         """
         super().__init__(scheme, compiled)
-        system, radius = compiled.base.system, vbd.VertexBlockDescent().spectral_radius
+        system = compiled.base.system
         parts = vbd.decompose_system(system, "hybrid")
-        self.sweeps = vbd.PreparedVertexBlockDescent.from_blocks(system, *parts, radius, compiled)
+        self.sweeps = vbd.PreparedVertexBlockDescent.from_blocks(system, *parts, 0.0, compiled)
         self.round_kernel, self.unpinned_trace = TypedKernel(run_sweep_rounds), compiled.base.unpinned_trace
 
     def init_state(self, problem: StepProblem, initial_guess: Positions) -> LbfgsSweepState:
@@ -71,7 +71,7 @@ class LbfgsSweepEngine(CompiledEngine):
 
     def _allocate_memory(self) -> AccelerationMemory:
         made = self.sweeps
-        return *super()._allocate_memory(), SweepStep(made.vertex_rows, made.spectral_radius, made.allocate_memory())
+        return *super()._allocate_memory(), SweepStep(made.vertex_rows, made.allocate_memory())
 
 
 class LbfgsSweepState(CompiledAccelerationState):

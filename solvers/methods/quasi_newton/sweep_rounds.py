@@ -38,7 +38,7 @@ ROUND_SWEEPS = 5
 """Sweeps of a round."""
 
 NOT_STARTED, MOVED = -2.0, -1.0
-"""Chebyshev factors before the first sweeps of a solve, and before those after an iteration of L-BFGS."""
+"""Values of `SweepScratch.omega` before the first sweeps of a solve, and before those after an iteration of L-BFGS."""
 
 CONTINUES, STARTS_AT_GUESS, STARTS_LOWER, STARTS_LOWER_MEASURED = range(4)
 """Whether rounds continue a solve or start it: at the initial guess, or at the lower one of the guess and the inertial
@@ -50,12 +50,10 @@ class SweepStep(NamedTuple):
 
     Attributes:
         vertex_rows: rows of the vertices.
-        spectral_radius: spectral radius of Chebyshev's extrapolation.
         sweep_memory: packets, positions in rows of four [m], right-hand side by packets [N], and scratch.
     """
 
     vertex_rows: VertexRows
-    spectral_radius: float
     sweep_memory: SweepMemory
 
 
@@ -121,7 +119,7 @@ def _window_decrease(state):
 def _sweep_vertices(state):
     """Do a round of sweeps, unless it raises the objective or, within round-off, the residual.
 
-    Sweeps that follow each other continue Chebyshev's extrapolation.
+    Sweeps that follow each other continue the extrapolation.
     """
     step, window, sweeps, arrays = state
     packets, rows, right, scratch = sweeps.sweep_memory
@@ -134,8 +132,8 @@ def _sweep_vertices(state):
     elif scratch.omega[0] == MOVED:
         _copy_vertices(window.position, window_row, rows, sweep_row)
         restart_sweeps(scratch, rows)
-    run_unchecked_sweeps(packets, right, sweeps.spectral_radius, scratch, rows, ROUND_SWEEPS)
-    _copy_vertices(rows, sweep_row, window.trial_position, window_row)
+    run_unchecked_sweeps(packets, right, scratch, rows, ROUND_SWEEPS)
+    _copy_vertices(scratch.older_positions, sweep_row, window.trial_position, window_row)
     if not _accept_lower_trial(step, window):
         scratch.omega[0] = MOVED
 

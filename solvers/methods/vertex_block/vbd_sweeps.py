@@ -44,7 +44,7 @@ class SweepScratch(NamedTuple):
         descent_scratch: scratch.
         spring_scratch: scratch for the springs of one packet.
         packet_sums: scratch of nine numbers per vertex of a packet.
-        omega: Chebyshev factor (1,), 0 at the start of a step.
+        omega: Chebyshev factor (1,), or number of sweeps since a restart; 0 at the start of a step.
         objective_value: the objective (1,), nan if it is unknown.
     """
 
@@ -160,8 +160,10 @@ def _chebyshev_weight(omega, radius):
 
 
 @jit_inner
-def run_unchecked_sweeps(blocks, right, radius, work, p, num_sweeps):
-    """Run sweeps with Chebyshev's extrapolation, without the objective.
+def run_unchecked_sweeps(blocks, right, work, p, num_sweeps):
+    """Run sweeps with Nesterov's extrapolation, without the objective.
+
+        x_(k+1) = S(y_k),   y_(k+1) = x_(k+1) + j/(j + 1) (x_(k+1) - x_k)      S a sweep, j the number since a restart
 
     The extrapolation restarts where a sweep turns against the last movement (O'Donoghue and Candes 2015, "Adaptive
     restart for accelerated gradient schemes": the gradient scheme). This costs a dot product instead of an evaluation
@@ -170,24 +172,22 @@ def run_unchecked_sweeps(blocks, right, radius, work, p, num_sweeps):
     Args:
         blocks: packets of the vertices.
         right: constant right-hand side [N] by packets, with anchor stiffnesses [N/m].
-        radius: spectral radius of Chebyshev's extrapolation.
-        work: scratch memory.
-        p: positions in rows of four [m], updated.
+        work: scratch memory; `older_positions` are those after the last sweep, x.
+        p: extrapolated positions y in rows of four [m], updated.
         num_sweeps: number of sweeps.
     """
-    omega, previous, older = work.omega, work.previous_positions, work.older_positions
+    count, previous, older = work.omega, work.previous_positions, work.older_positions
     step, size = work.descent_scratch, 4 * blocks.num_free
     for _ in range(num_sweeps):
-        w = _chebyshev_weight(omega[0], radius)
         _copy_positions(p, previous)
         _sweep_vertices(blocks, None, None, right, p, work)
         for k in range(size):
-            step[k], older[k] = p[k] - previous[k], previous[k] - older[k]
-        omega[0] = w = w if ordered_dot(step, older, size) >= 0.0 else 0.0
-        if w > 1.0:
-            for k in range(size):
-                p[k] = previous[k] - older[k] + w * (step[k] + older[k])
-        _copy_positions(previous, older)
+            step[k], older[k] = p[k] - previous[k], p[k] - older[k]
+        count[0] = count[0] + 1.0 if ordered_dot(step, older, size) >= 0.0 else 0.0
+        momentum = count[0] / (count[0] + 1.0)
+        for k in range(size):
+            x, movement = p[k], older[k]
+            p[k], older[k] = x + momentum * movement, x
 
 
 def build_iteration(sweep: Any, level: Any) -> Any:
