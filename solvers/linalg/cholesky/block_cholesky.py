@@ -181,7 +181,7 @@ class BlockCholesky:
 
     @cached_property
     def failure_costs(self) -> NDArray[np.float64]:
-        """Cost of a factorisation that fails at a supernode, relative to a whole one, for each supernode (s,)."""
+        """Cost of a factorisation that fails at each supernode (s,), relative to a whole one."""
         done = np.concatenate([[0.0], np.cumsum(self._flops)[:-1]]) / self.flops
         return np.maximum(_MIN_FACTORISATION, done)
 

@@ -57,7 +57,7 @@ class AcceleratedState(SolverState):
 
     @property
     def kernel_data(self) -> tuple[Any, Any, Any, Any, Any, Any] | None:
-        """Data for kernels that continue with iterations of the solve; None if the iterations are not compiled."""
+        """Data for kernels that iterate further; None if the iterations are not compiled."""
         return None
 
     @abstractmethod

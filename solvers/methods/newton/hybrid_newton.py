@@ -142,8 +142,8 @@ sweeps: beyond it the rounding of positions changes the elastic energy by more t
 and a residual of 1e-6 is round-off of the kernels of L-BFGS."""
 
 _SWEEP_FIRST_RATIO = 500.0
-"""Largest ratio of the diagonal of Q to the inertia at which a solve starts with sweeps: Chebyshev's iteration then
-divides the objective by ten in about as many sweeps as a group has iterations."""
+"""Largest ratio of the diagonal of Q to the inertia at which a solve starts with sweeps: they then divide the objective
+by ten in about as many sweeps as a group has iterations."""
 
 _ROUND_END_COST, _COLLISION_CHECK_COST = 0.1, 20.0
 """Costs of the end of a round and of a check for collisions, in iterations of L-BFGS: 0.01 to 0.4 for a call of the

@@ -45,7 +45,9 @@ def reduce_shift(value: float, ratio: float, max_value: float) -> float:
 
 @register_jitable(**jit_inner_options)
 def increase_shift(value: float, max_value: float) -> float:
-    """Return the larger shift after one that has no factor, infinite beyond the largest finite one.
+    """Return the larger shift after one that has no factor.
+
+    It is infinite beyond the largest finite one.
 
     Args:
         value: current shift.

@@ -29,7 +29,7 @@ from springbench.solvers.methods.newton.newton_kernel import NewtonArrays, run_m
 from springbench.solvers.methods.newton.predicted_tension_kernel import (
     PREDICTED_PROGRESS_DTYPE,
     QUADRATIC_SLOPE_RATIO,
-    Relaxation,
+    LocalRelaxation,
     StepBudget,
     project_displacement,
     run_predicted_steps,
@@ -238,7 +238,7 @@ class PredictedTensionNewton:
             self.relaxation = self._method.start_lbfgs(step, point.positions)
         if (data := self.relaxation.kernel_data) is None:
             return None
-        relaxation = Relaxation(*data, RELAXATION_ITERATIONS, not self._method.is_very_stiff)
+        relaxation = LocalRelaxation(*data, RELAXATION_ITERATIONS, not self._method.is_very_stiff)
         progress = np.zeros(1, PREDICTED_PROGRESS_DTYPE)
         progress[0] = shift.value, shift.max_value, shift.ratio, shift.can_reduce, self._slope, False
         at = self._first_point or point

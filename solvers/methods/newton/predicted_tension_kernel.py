@@ -49,7 +49,7 @@ PREDICTED_PROGRESS_DTYPE = np.dtype(
 """The progress of a solve."""
 
 
-class Relaxation(NamedTuple):
+class LocalRelaxation(NamedTuple):
     """The L-BFGS iterations after a step.
 
     Attributes:
@@ -96,7 +96,7 @@ class _PredictedState(NamedTuple):
     arrays: NewtonArrays
     step_data: Any
     exact_pins: Any
-    relaxation: Relaxation
+    relaxation: LocalRelaxation
     failure_costs: NDArray[np.float64]
     tensions: NDArray[np.float64]
     predicted: NDArray[np.float64]
@@ -124,7 +124,9 @@ def run_predicted_steps(
     costs,
     progress,
 ):
-    """Run steps of Newton's method with predicted tensions, up to one that does not decrease the objective.
+    """Run steps of Newton's method with predicted tensions.
+
+    The first that does not decrease the objective is the last one.
 
     Args:
         arrays: arrays of the system.
@@ -178,7 +180,7 @@ def _add_recent(recent, decrease, cost):
 
 @jit_inner
 def _take_step(state, compared, is_compared):
-    """Do a step; return the decrease of the objective [J], zero for no step, and the factorisations made."""
+    """Do a step; return the decrease of the objective [J], or zero, and the factorisations made."""
     now, search, d, length = state.progress[0], state.arrays.search, state.arrays.direction, 1.0
     p, gradient, q, there = state.p, state.gradient, search.trial_positions, search.trial_gradient
     terms, tensions = (search.objective_terms, search.quadratic_form, state.step_data), state.tensions
@@ -263,7 +265,7 @@ def _solve_shifted(state, shift):
 
 @jit_inner
 def _relax_positions(state):
-    """Do the L-BFGS iterations from the trial point, and write the trial point at their end."""
+    """Do the L-BFGS iterations, which move the trial point."""
     search, r = state.arrays.search, state.relaxation
     q, there = search.trial_positions, search.trial_gradient
     iterate_from(r.step, r.window, r.negative_pairs, r.target, r.force, r.pin_targets, r.num_iterations, q, there)

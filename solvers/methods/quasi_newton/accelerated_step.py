@@ -109,7 +109,7 @@ def iterate_from(step, window, negative_pairs, target, force, pin_targets, num_i
 def start_lower_solve(
     step, window, target, force, pin_targets, guess, external_force, compares_prediction, measures_guess, out
 ):
-    """Start the solve at a guess, or at the lower one of the guess and the inertial prediction.
+    """Start the solve at a guess, or at the inertial prediction if that is lower.
 
     Args:
         step: data of the system; its vectors and objective values are overwritten.
