@@ -467,7 +467,7 @@ class LbfgsFirstState(HybridState):
 def limit_rounds(limits: LoopLimits) -> LoopLimits:
     """Return the limits of rounds of a solve with these limits."""
     limit = limits.residual_limit if limits.residual_mode == RESIDUAL_EACH else 0.0
-    return limits._replace(residual_limit=limit)
+    return LoopLimits(limits.max_iterations, limit, limits.residual_floor, limits.residual_mode)
 
 
 class MeasuredRule(ShiftScheduleRule):
