@@ -14,13 +14,13 @@ one is added: along unstable directions the step is longer, the closer that mult
 Sorensen 1983).
 
 L-BFGS runs first. If the factor of Q exceeds the cache, it is in float32, unless Q is so stiff that its directions
-would have no digit: the iterations are then limited by memory bandwidth, and directions need no more digits. If the
-initial guess are the current positions, the start is the better of these and the inertial prediction. Near the minimum,
-where an iteration of L-BFGS decreases the objective by at most 5e-5 of the decrease so far, groups of its iterations
-alternate with rounds of sweeps of vertex block descent (`springbench.solvers.methods.quasi_newton.sweep_rounds`). More
-rounds of sweeps follow as long as each reduces the residual to 0.56 of it. The sweeps come first if no diagonal entry
-of Q exceeds 500 times the inertia; there are none if one exceeds the inertia over the square root of the machine
-epsilon.
+would have no digit: the iterations are then limited by memory bandwidth, and directions need no more digits. A solve
+whose initial guess is the current positions starts at the lower one of these and the inertial prediction. Near the
+minimum, where an iteration of L-BFGS decreases the objective by at most 5e-5 of the decrease so far, groups of its
+iterations alternate with rounds of sweeps of vertex block descent
+(`springbench.solvers.methods.quasi_newton.sweep_rounds`). More rounds of sweeps follow as long as each reduces the
+residual to 0.56 of it. The sweeps come first if no diagonal entry of Q exceeds 500 times the inertia; there are none if
+one exceeds the inertia over the square root of the machine epsilon.
 
 One rule decides which of the three methods continues: that with the largest decrease of the objective per cost in its
 last steps. A method that was not yet measured is credited with the decrease that L-BFGS leaves, extrapolated from its
@@ -668,8 +668,8 @@ class HybridIteration:
 
         Args:
             step: objective of the step.
-            p: positions (n, 3) [m]; if the step's guess are its current positions, the inertial prediction replaces
-                them if it is lower.
+            p: positions (n, 3) [m]; if the step's guess is its current positions, the inertial prediction replaces
+                them where it is lower.
             control: limits of the next iterations, read for each point; counts and costs are recorded there.
         """
         if step.problem.initial_guess is step.problem.current_positions:

@@ -60,8 +60,7 @@ class LbfgsSweepEngine(CompiledEngine):
     def prepare_state(self, problem: StepProblem, initial_guess: Positions) -> LbfgsSweepState:
         """Prepare a solve, which its first rounds start.
 
-        If the step's guess are its current positions, it starts at the lower one of a guess and the inertial
-        prediction.
+        If the step's guess is its current positions, it starts at the lower one of these and the inertial prediction.
 
         Args:
             problem: step whose objective is minimised.

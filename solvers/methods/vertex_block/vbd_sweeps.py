@@ -165,9 +165,10 @@ def run_unchecked_sweeps(blocks, right, work, p, num_sweeps):
 
         x_(k+1) = S(y_k),   y_(k+1) = x_(k+1) + j/(j + 1) (x_(k+1) - x_k)      S a sweep, j the number since a restart
 
-    The extrapolation restarts where a sweep turns against the last movement (O'Donoghue and Candes 2015, "Adaptive
-    restart for accelerated gradient schemes": the gradient scheme). This costs a dot product instead of an evaluation
-    of the objective, and the objective may increase.
+    The factor j/(j + 1) grows faster than Nesterov's (j - 1)/(j + 2), as restarts are frequent. The extrapolation
+    restarts where a sweep turns against the last movement (O'Donoghue and Candes 2015, "Adaptive restart for
+    accelerated gradient schemes": the gradient scheme). This costs a dot product instead of an evaluation of the
+    objective, and the objective may increase.
 
     Args:
         blocks: packets of the vertices.
