@@ -149,6 +149,12 @@ def backtracking_line_search(
     return None
 
 
+def guesses_current_positions(problem: StepProblem) -> bool:
+    """Return whether the initial guess of a step is its current positions."""
+    guess, current = problem.initial_guess, problem.current_positions
+    return guess is current or np.array_equal(guess, current)
+
+
 def lower_start_positions(step: StepObjective, p: Positions) -> Positions:
     """Return given positions or the inertial prediction, if that is lower.
 

@@ -16,9 +16,10 @@ prediction.
 A round ends with a check, which costs c iterations. Rounds of s iterations cost c/s per iteration, and the last one
 makes s/2 iterations superfluous. With n iterations, n c/s + s/2 is minimal for s = sqrt(2 c n). Rounds have twice that
 length: this costs a quarter more than the minimum, and halves the number of rounds, which limits of iterations count.
-If there are sweeps and a check costs less than an iteration, a round also has at most one iteration more than an eighth
-of those before it, so that a solve of few iterations does not end much later than it could. There are no sweeps where
-springs are so stiff that residuals near the tolerance are round-off, which more checks would meet more often.
+If there are sweeps and a check costs less than an iteration, a round also has at most one iteration more than a
+sixteenth of those before it, so that a solve of few iterations does not end much later than it could. There are no
+sweeps where springs are so stiff that residuals near the tolerance are round-off, which more checks would meet more
+often.
 """
 
 from __future__ import annotations
@@ -48,7 +49,7 @@ GROUP_ITERATIONS = 10
 PROBE_ITERATIONS = 4
 """Iterations before the suitability of the method is assessed."""
 
-_MAX_ROUND_FRACTION = 1.0 / 8.0
+_MAX_ROUND_FRACTION = 1.0 / 16.0
 """Length of a round in addition to one iteration, as a fraction of the iterations before it; for checks that cost less
 than an iteration."""
 

@@ -272,7 +272,7 @@ def test_a_round_costs_a_quarter_more_than_the_least_and_ends_at_decisions(check
     while rounds.num_iterations < 200:
         size, n = descent_rounds.round_size(rounds), int(rounds.num_iterations)
         most, left = 1.25 * (2.0 * check_cost * n) ** 0.5, (4 if n < 4 else rounds.group_end) - n
-        left = min(left, 1 + n // 8) if check_cost < 1.0 else left
+        left = min(left, 1 + n // 16) if check_cost < 1.0 else left
         assert 1 <= size <= left
         assert size in (1, left) or n * check_cost / (size - 1) + (size - 1) / 2.0 <= most
         assert size == left or n * check_cost / (size + 1) + (size + 1) / 2.0 > most

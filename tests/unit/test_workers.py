@@ -95,8 +95,9 @@ def test_a_worker_is_another_process_and_stays(workers: IsolatedWorker):
 
 def test_a_worker_that_died_in_between_is_replaced(workers: IsolatedWorker):
     first = workers.run_task(does.worker_pid, quiet, NONE)
-    os.kill(first, 9)
-    psutil.wait_procs([psutil.Process(first)], timeout=10.0) if psutil.pid_exists(first) else None
+    dying = psutil.Process(first)
+    dying.kill()
+    psutil.wait_procs([dying], timeout=10.0)
     assert workers.run_task(does.worker_pid, quiet, NONE) != first
 
 

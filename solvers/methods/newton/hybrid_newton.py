@@ -62,6 +62,7 @@ from springbench.solvers.iteration.descent_method import (
     DescentPoint,
     PreparedDescent,
     ResidualMetric,
+    guesses_current_positions,
     has_active_barrier,
     inner_product,
     lower_start_positions,
@@ -672,7 +673,7 @@ class HybridIteration:
                 them where it is lower.
             control: limits of the next iterations, read for each point; counts and costs are recorded there.
         """
-        if step.problem.initial_guess is step.problem.current_positions:
+        if guesses_current_positions(step.problem):
             p = lower_start_positions(step, p)
         yield from self.continue_from(step, DescentPoint(p, NO_GRADIENT), control)
 

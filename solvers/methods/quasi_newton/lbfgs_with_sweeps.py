@@ -9,16 +9,15 @@ from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from springbench.solvers.jit.typed_kernel import TypedKernel
+from springbench.solvers.jit.typed_kernel import TypedKernel, as_kernel_array
 from springbench.solvers.kernels.iteration_loop import NO_ITERATIONS, LoopLimits
 from springbench.solvers.methods.local_global.accelerated_local_global import AccelerationScheme
 from springbench.solvers.methods.local_global.fused_local_global import PreparedCompiledLocalGlobal
 from springbench.solvers.methods.quasi_newton.sweep_rounds import (
     CONTINUES,
     NOT_STARTED,
-    STARTS_AT_GUESS,
-    STARTS_LOWER,
-    STARTS_LOWER_MEASURED,
+    STARTS,
+    STARTS_MEASURED,
     StepArrays,
     SweepStep,
     run_sweep_rounds,
@@ -93,10 +92,10 @@ class LbfgsSweepState(CompiledAccelerationState):
         if (memory := engine.sweeps.update_packets(sweeps.sweep_memory, problem)) is not sweeps.sweep_memory:
             sweeps = sweeps._replace(sweep_memory=memory)
         self.start_positions = np.empty(guess.shape)
-        arrays = StepArrays(*self._step_arrays, self._external_force, self.start_positions, self.positions)
+        given = *self._step_arrays, self._external_force, as_kernel_array(problem.current_positions)
+        arrays = StepArrays(*given, self.start_positions, self.positions)
         self._round_arguments = *self._state, sweeps, arrays
-        self._round_kernel, self._trace = engine.round_kernel, engine.unpinned_trace
-        self._start_kind = STARTS_LOWER if problem.initial_guess is problem.current_positions else STARTS_AT_GUESS
+        self._round_kernel, self._trace, self._start_kind = engine.round_kernel, engine.unpinned_trace, STARTS
 
     def start_at_guess(self) -> Self:
         """Start the solve at the initial guess; return the state."""
@@ -113,7 +112,7 @@ class LbfgsSweepState(CompiledAccelerationState):
         Returns:
             The residual at the guess [J^(1/2)].
         """
-        return self._start_solve(rounds, STARTS_LOWER_MEASURED)
+        return self._start_solve(rounds, STARTS_MEASURED)
 
     def _start_solve(self, rounds: NDArray[Any], start: int) -> float:
         """Start the solve without rounds; return the residual at the guess [J^(1/2)] or NaN."""
@@ -130,6 +129,6 @@ class LbfgsSweepState(CompiledAccelerationState):
             limits: limits, in rounds.
         """
         if self._start_kind != CONTINUES and self._engine.has_energy_scales:
-            self._start_solve(rounds, self._start_kind)
+            self._start_solve(rounds, STARTS)
         start, self._start_kind = self._start_kind, CONTINUES
         return self._round_kernel.call(*self._round_arguments, start, self._trace, rounds, limits)[:3]

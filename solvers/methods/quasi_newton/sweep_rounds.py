@@ -40,9 +40,8 @@ ROUND_SWEEPS = 5
 NOT_STARTED, MOVED = -2.0, -1.0
 """Values of `SweepScratch.omega` before the first sweeps of a solve, and before those after an iteration of L-BFGS."""
 
-CONTINUES, STARTS_AT_GUESS, STARTS_LOWER, STARTS_LOWER_MEASURED = range(4)
-"""Whether rounds continue a solve or start it: at the initial guess, or at the lower one of the guess and the inertial
-prediction, without or with the residual at the guess."""
+CONTINUES, STARTS, STARTS_MEASURED = range(3)
+"""Whether rounds continue a solve or start it, and then measure the residual at the initial guess."""
 
 
 class SweepStep(NamedTuple):
@@ -66,6 +65,8 @@ class StepArrays(NamedTuple):
         pin_targets: target positions of the pins (q, 3) [m].
         guess: initial guess (n, 3) [m].
         external_force: force of the inertial prediction (n, 3) [N].
+        current: positions at the start of the step (n, 3) [m]; a guess that differs from them is not compared with the
+            inertial prediction.
         start: output, positions at the start (n, 3) [m].
         positions: output, positions (n, 3) [m].
     """
@@ -75,6 +76,7 @@ class StepArrays(NamedTuple):
     pin_targets: NDArray[np.float64]
     guess: NDArray[np.float64]
     external_force: NDArray[np.float64]
+    current: NDArray[np.float64]
     start: NDArray[np.float64]
     positions: NDArray[np.float64]
 
@@ -161,6 +163,16 @@ def _accept_lower_trial(step, window):
     return True
 
 
+@jit_inner
+def _are_equal(p, q):
+    """Return whether all positions (n, 3) are equal."""
+    are_equal = True
+    for v in range(len(p)):
+        for c in range(3):
+            are_equal &= p[v, c] == q[v, c]
+    return are_equal
+
+
 _iterate_rounds = build_compiled_rounds(_step_window, _window_residual, _window_decrease, _sweep_vertices)
 
 
@@ -182,7 +194,8 @@ def run_sweep_rounds(
         window: state of the solve, updated.
         sweeps: data of the sweeps; its arrays of the solve are updated.
         arrays: arrays of the solve.
-        start: CONTINUES or how the solve starts first: STARTS_AT_GUESS, STARTS_LOWER or STARTS_LOWER_MEASURED.
+        start: CONTINUES, STARTS or STARTS_MEASURED: whether the solve starts first, and whether the residual at the
+            guess is computed.
         unpinned_trace: sum of the diagonal of Q over the unpinned vertices [N/m], for the residual's round-off.
         rounds: state of the rounds (1,) of type ROUND_STATE_DTYPE, updated.
         limits: limits of the loop, in rounds. A start without rounds does not compute the last residual.
@@ -201,8 +214,8 @@ def run_sweep_rounds(
             arrays.pin_targets,
             arrays.guess,
             arrays.external_force,
-            start != STARTS_AT_GUESS,
-            start == STARTS_LOWER_MEASURED,
+            _are_equal(arrays.guess, arrays.current),
+            start == STARTS_MEASURED,
             arrays.start,
         )
         rounds[0].residual_floor = EPS * compute_max_magnitude(arrays.start) * np.sqrt(unpinned_trace)
