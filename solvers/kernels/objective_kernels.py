@@ -354,6 +354,21 @@ def try_step(terms, form, step_data, exact_pins, p, direction, step_size, slope,
 
 
 @jit_inner
+def compute_product_with_displacement(a, p, q):
+    """Return the inner product of a field and a displacement over all vertices.
+
+    Args:
+        a: field (n, 3), such as a gradient [N].
+        p, q: positions (n, 3) [m] before and after the displacement.
+    """
+    total = 0.0
+    for v in range(len(p)):
+        for c in range(3):
+            total += a[v, c] * (q[v, c] - p[v, c])
+    return total
+
+
+@jit_inner
 def compute_inner_product(a, b):
     """Return the inner product of two fields over all vertices.
 

@@ -754,11 +754,19 @@ class HybridIteration:
         """
 
         def run_lbfgs() -> DescentPoint:
-            run = self.start_lbfgs(step, at.positions)
-            run.run_iterations(LoopLimits(RELAXATION_ITERATIONS, 0.0, 0.0, RESIDUAL_NEVER))
-            return self.read_point(step, run)
+            return self.relax_point(step, self.start_lbfgs(step, at.positions))
 
         return self.newton.iteration_phases(step, at) | {"lbfgs": run_lbfgs}
+
+    def relax_point(self, step: StepObjective, run: AcceleratedState) -> DescentPoint:
+        """Return the point after a few iterations of L-BFGS.
+
+        Args:
+            step: objective of the step.
+            run: state of L-BFGS at the start of a solve.
+        """
+        run.run_iterations(LoopLimits(RELAXATION_ITERATIONS, 0.0, 0.0, RESIDUAL_NEVER))
+        return self.read_point(step, run)
 
     def read_point(self, step: StepObjective, run: AcceleratedState) -> DescentPoint:
         """Return the current point of L-BFGS.

@@ -25,7 +25,11 @@ from springbench.solvers.kernels.iteration_loop import (
     build_compiled_loop,
     check_residual,
 )
-from springbench.solvers.kernels.objective_kernels import change_objective, compute_inner_product
+from springbench.solvers.kernels.objective_kernels import (
+    change_objective,
+    compute_inner_product,
+    compute_product_with_displacement,
+)
 from springbench.solvers.kernels.residual_norm import compute_residual_norm
 from springbench.solvers.kernels.spring_hessian import BlockIndices, assemble_hessian
 from springbench.solvers.linalg.cholesky.block_cholesky import KernelFactor
@@ -239,10 +243,7 @@ def _take_measured_step(state, decrease):
     now, search, q = progress[0], arrays.search, arrays.search.trial_positions
     if not _find_exact_step(state):
         return False
-    slope = 0.0
-    for v in range(len(p)):
-        for c in range(3):
-            slope += gradient[v, c] * (p[v, c] - q[v, c])
+    slope = -compute_product_with_displacement(gradient, p, q)
     decrease[0] = max(0.0, -change_objective(search.objective_terms, search.quadratic_form, step_data, p, q))
     move_to_trial(search, p, gradient)
     now.slope, now.agrees_with_model = slope, 0

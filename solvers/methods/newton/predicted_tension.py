@@ -20,7 +20,7 @@ from springbench.solvers.iteration.descent_method import (
     inner_product,
 )
 from springbench.solvers.jit.typed_kernel import TypedKernel
-from springbench.solvers.kernels.iteration_loop import RESIDUAL_NEVER, LoopLimits
+from springbench.solvers.kernels.iteration_loop import LoopLimits
 from springbench.solvers.kernels.line_search_conditions import is_armijo_step
 from springbench.solvers.methods.local_global.accelerated_local_global import AcceleratedState
 from springbench.solvers.methods.newton.inertia_shift import MODEL_DECREASE_FRACTION, InertiaShift
@@ -90,12 +90,12 @@ class RelaxationMethod(Protocol):
         """
         ...
 
-    def read_point(self, step: StepObjective, run: AcceleratedState) -> DescentPoint:
-        """Return the current point of L-BFGS.
+    def relax_point(self, step: StepObjective, run: AcceleratedState) -> DescentPoint:
+        """Return the point after local relaxation, which removes the second-order stretch of a step.
 
         Args:
             step: objective of the step.
-            run: state of L-BFGS.
+            run: state of L-BFGS at the end of a Newton step.
         """
         ...
 
@@ -290,14 +290,10 @@ class PredictedTensionNewton:
         return length, self._relax_point(found.positions), False
 
     def _relax_point(self, p: Positions) -> DescentPoint:
-        """Return the point after local relaxation of positions p (n, 3) [m].
-
-        It removes the second-order stretch of a step.
-        """
+        """Return the point after local relaxation of positions p (n, 3) [m]."""
         last, step = self.relaxation, self._step
         run = self.relaxation = self._method.start_lbfgs(step, p) if last is None else last.restart_at(p)
-        run.run_iterations(LoopLimits(RELAXATION_ITERATIONS, 0.0, 0.0, RESIDUAL_NEVER))
-        return self._method.read_point(step, run)
+        return self._method.relax_point(step, run)
 
 
 def compute_objective_decrease(step: StepObjective, before: DescentPoint, after: DescentPoint) -> float:

@@ -17,6 +17,7 @@ from springbench.solvers.kernels.line_search_conditions import MAX_HALVINGS, is_
 from springbench.solvers.kernels.objective_kernels import (
     change_objective,
     compute_inner_product,
+    compute_product_with_displacement,
     move_to_targets,
     try_step,
     write_free_gradient,
@@ -285,10 +286,7 @@ def _search_rounded(state, slope):
     for _ in range(MAX_HALVINGS if slope < 0.0 else 0):
         change, is_sufficient = try_step(*terms, p, d, step_size, slope, 0.0, q, there)
         if not is_sufficient and change < 0.0:
-            rounded_slope = 0.0
-            for v in range(len(p)):
-                for c in range(3):
-                    rounded_slope += gradient[v, c] * (q[v, c] - p[v, c])
+            rounded_slope = compute_product_with_displacement(gradient, p, q)
             is_sufficient = rounded_slope < 0.0 and is_armijo_step(change, 1.0, rounded_slope, 0.0)
         if is_sufficient:
             return True
@@ -304,8 +302,4 @@ def project_displacement(p, q, d):
         p, q: positions (n, 3) [m].
         d: direction (n, 3) [m].
     """
-    product = 0.0
-    for v in range(len(p)):
-        for c in range(3):
-            product += (q[v, c] - p[v, c]) * d[v, c]
-    return product / compute_inner_product(d, d)
+    return compute_product_with_displacement(d, p, q) / compute_inner_product(d, d)

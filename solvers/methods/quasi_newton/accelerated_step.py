@@ -106,9 +106,7 @@ def iterate_from(step, window, negative_pairs, target, force, pin_targets, num_i
 
 
 @jit_inner
-def start_lower_solve(
-    step, window, target, force, pin_targets, guess, external_force, compares_prediction, measures_guess, out
-):
+def start_lower_solve(step, window, target, force, pin_targets, guess, external_force, current, measures_guess, out):
     """Start the solve at a guess, or at the inertial prediction if that is lower.
 
     Args:
@@ -119,7 +117,8 @@ def start_lower_solve(
         pin_targets: target positions of the pins (q, 3) [m].
         guess: initial guess (n, 3) [m].
         external_force: force of the inertial prediction (n, 3) [N].
-        compares_prediction: whether the inertial prediction is compared.
+        current: positions at the start of the step (n, 3) [m]; a guess that differs from them is not compared with the
+            inertial prediction.
         measures_guess: whether the residual at the guess is computed.
         out: output (n, 3) [m], the positions at the start.
 
@@ -132,7 +131,7 @@ def start_lower_solve(
         _start_window(step, window)
         at_guess = compute_window_residual((step, window))
     is_lower = False
-    if compares_prediction:
+    if not _differs(guess.flat, current.flat, guess.size):
         for k in range(size):
             window.position[k], window.descent[k] = window.trial_position[k], window.trial_descent[k]
         predict_positions(rows.inertia_diagonal, target, external_force, rows.pinned_vertices, pin_targets, out)

@@ -163,16 +163,6 @@ def _accept_lower_trial(step, window):
     return True
 
 
-@jit_inner
-def _are_equal(p, q):
-    """Return whether all positions (n, 3) are equal."""
-    are_equal = True
-    for v in range(len(p)):
-        for c in range(3):
-            are_equal &= p[v, c] == q[v, c]
-    return are_equal
-
-
 _iterate_rounds = build_compiled_rounds(_step_window, _window_residual, _window_decrease, _sweep_vertices)
 
 
@@ -214,7 +204,7 @@ def run_sweep_rounds(
             arrays.pin_targets,
             arrays.guess,
             arrays.external_force,
-            _are_equal(arrays.guess, arrays.current),
+            arrays.current,
             start == STARTS_MEASURED,
             arrays.start,
         )
