@@ -56,10 +56,6 @@ than an iteration."""
 _FAST_RESIDUAL_RATIO = 0.5
 """Largest ratio of residuals after the very first iterations at which the method is considered suitable."""
 
-_NEAR_FRACTION = 5e-5
-"""Largest decrease per iteration, as a fraction of that since the start, at which sweeps may follow L-BFGS: far from a
-minimum they lead to other, higher minima more often."""
-
 _NEAR_ITERATIONS = 4
 """Smallest number of iterations over which that decrease is averaged."""
 
@@ -87,6 +83,7 @@ ROUND_STATE_DTYPE = np.dtype(
         ("is_sweeping", np.int64),  # whether the next round consists of sweeps
         ("segment_end", np.int64),  # iterations after which sweeps may follow
         ("segment_residual", np.float64),  # residual at the last choice [J^(1/2)]; 0: not known
+        ("near_fraction", np.float64),  # largest decrease per iteration over that so far at which sweeps may follow
         ("late_start", np.int64),  # iterations from which the decrease per iteration is averaged
         ("late_decrease", np.float64),  # decrease of the objective there [J]
         ("residual_floor", np.float64),  # residual that rounded positions leave [J^(1/2)]
@@ -114,7 +111,7 @@ def _choose_sweeps(now, decrease, residual):
         continues = residual < _SWEEP_RESIDUAL_RATIO * now.segment_residual
     else:
         count = now.num_iterations - now.late_start
-        continues = decrease - now.late_decrease <= _NEAR_FRACTION * count * decrease
+        continues = decrease - now.late_decrease <= now.near_fraction * count * decrease
     now.is_sweeping = 1 if continues else 0
     now.segment_end, now.segment_residual = now.num_iterations + GROUP_ITERATIONS, residual
 
@@ -226,18 +223,27 @@ def build_compiled_rounds(
     return jit_closure(build_rounds(build_unchecked_steps(step_state), residual, decrease, sweep))
 
 
-def init_rounds(newton_cost: float, check_cost: float, sweep_cost: int = 0, *, starts_sweeping: bool = False) -> Any:
+def init_rounds(
+    newton_cost: float,
+    check_cost: float,
+    sweep_cost: int = 0,
+    near_fraction: float = 0.0,
+    *,
+    starts_sweeping: bool = False,
+) -> Any:
     """Return the state of rounds at their start, (1,).
 
     Args:
         newton_cost: cost of a Newton step, in groups.
         check_cost: cost of the end of a round, in iterations.
         sweep_cost: cost of a round of sweeps, in iterations; 0 for no sweeps.
+        near_fraction: largest decrease of the objective per iteration, as a fraction of that since the start, at which
+            sweeps may follow.
         starts_sweeping: whether the first round consists of sweeps.
     """
     initial = np.zeros(1, ROUND_STATE_DTYPE)
     initial["group_end"] = initial["segment_end"] = GROUP_ITERATIONS
     initial["initial_residual"], initial["gain"], initial["gain_ratio"] = -1.0, np.inf, 1.0
     initial["newton_cost"], initial["check_cost"] = newton_cost, check_cost
-    initial["sweep_cost"], initial["is_sweeping"] = sweep_cost, starts_sweeping
+    initial["sweep_cost"], initial["near_fraction"], initial["is_sweeping"] = sweep_cost, near_fraction, starts_sweeping
     return initial

@@ -22,6 +22,7 @@ from springbench.solvers.kernels.iteration_loop import REASON_ITERATIONS, RESIDU
 from springbench.solvers.linalg.cholesky import symbolic_factorisation
 from springbench.solvers.methods.newton import hybrid_newton
 from springbench.solvers.methods.newton.hybrid_newton import (
+    HybridIteration,
     HybridNewton,
     LbfgsFirstState,
     MeasuredRule,
@@ -161,7 +162,7 @@ def test_soft_springs_are_first_left_to_sweeps(guess):
 
 def build_rounds_at(**fields):
     """The state of rounds after a group of ten iterations that decreased the objective by one."""
-    (rounds,) = descent_rounds.init_rounds(4.0, 0.1, 3).view(np.recarray)
+    (rounds,) = descent_rounds.init_rounds(4.0, 0.1, 3, 5e-5).view(np.recarray)
     rounds.num_iterations, rounds.segment_residual = 10, 1.0
     for name, value in fields.items():
         setattr(rounds, name, value)
@@ -174,6 +175,20 @@ def test_sweeps_follow_iterations_near_the_minimum_only(last_decrease, follow):
     rounds = build_rounds_at(late_start=8, late_decrease=1.0 - last_decrease)
     descent_rounds._choose_sweeps(rounds, 1.0, 0.5)
     assert rounds.is_sweeping == follow
+
+
+@pytest.mark.parametrize(("ratio", "fraction"), [(4990.0, 5e-3), (5010.0, 5e-5)])
+def test_sweeps_follow_earlier_in_soft_systems(ratio, fraction):
+    """A system is soft up to a ratio of 5000 of the diagonal of Q, 1 + c k dt^2/m, to the inertia."""
+
+    def prepare_method(stiffness: float) -> HybridIteration:
+        prepared = HybridNewton().prepare(stiff(stiffness).system)
+        assert isinstance(prepared, PreparedHybrid)
+        return prepared.method
+
+    method = prepare_method(1.0)
+    factor = (method.metric.free_diagonal / method.inertia_diagonal[::3]).max() - 1.0
+    assert prepare_method((ratio - 1.0) / factor).init_rounds()["near_fraction"] == fraction
 
 
 @pytest.mark.parametrize(("residual", "follow"), [(0.57, 0), (0.56, 1)])

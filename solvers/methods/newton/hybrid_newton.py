@@ -16,11 +16,12 @@ Sorensen 1983).
 L-BFGS runs first. If the factor of Q exceeds the cache, it is in float32, unless Q is so stiff that its directions
 would have no digit: the iterations are then limited by memory bandwidth, and directions need no more digits. A solve
 whose initial guess is the current positions starts at the lower one of these and the inertial prediction. Near the
-minimum, where an iteration of L-BFGS decreases the objective by at most 5e-5 of the decrease so far, groups of its
-iterations alternate with rounds of sweeps of vertex block descent
+minimum, groups of its iterations alternate with rounds of sweeps of vertex block descent
 (`springbench.solvers.methods.quasi_newton.sweep_rounds`). More rounds of sweeps follow as long as each reduces the
-residual to 0.56 of it. The sweeps come first if no diagonal entry of Q exceeds 500 times the inertia; there are none if
-one exceeds the inertia over the square root of the machine epsilon.
+residual to 0.56 of it. Near means that an iteration of L-BFGS decreases the objective by at most 5e-5 of the decrease
+so far, and by at most 5e-3 of it if no diagonal entry of Q exceeds 5000 times the inertia: sweeps far from a minimum
+lead to other, higher minima more often, the stiffer the springs. The sweeps come first if no entry exceeds 500 times
+the inertia; there are none if one exceeds the inertia over the square root of the machine epsilon.
 
 One rule decides which of the three methods continues: that with the largest decrease of the objective per cost in its
 last steps. A method that was not yet measured is credited with the decrease that L-BFGS leaves, extrapolated from its
@@ -145,6 +146,11 @@ and a residual of 1e-6 is round-off of the kernels of L-BFGS."""
 _SWEEP_FIRST_RATIO = 500.0
 """Largest ratio of the diagonal of Q to the inertia at which a solve starts with sweeps: they then divide the objective
 by ten in about as many sweeps as a group has iterations."""
+
+_SOFT_RATIO, _NEAR_FRACTION, _SOFT_NEAR_FRACTION = 5e3, 5e-5, 5e-3
+"""Decrease of an iteration of L-BFGS, as a fraction of that since the start, at which sweeps may follow, and that up to
+a ratio of the diagonal of Q to the inertia. There the larger fraction saves 10 % of the time on the scenes of
+`configs/accuracy.yaml`; beyond it solves take 0.7 to 1.3 times as long, and often end in another minimum."""
 
 _ROUND_END_COST, _COLLISION_CHECK_COST = 0.1, 20.0
 """Costs of the end of a round and of a check for collisions, in iterations of L-BFGS: 0.01 to 0.4 for a call of the
@@ -384,7 +390,6 @@ class LbfgsFirstState(HybridState):
     """
 
     _run: LbfgsSweepState | None = None
-    _limits = _round_limits = ONE_ITERATION  # the last ones, and those of rounds
     _num_rounds = 0
     _is_lbfgs_alone = True
 
@@ -418,9 +423,7 @@ class LbfgsFirstState(HybridState):
         if control.must_escape:
             self._end_lbfgs_alone(run, np.inf, REASON_ITERATIONS)
             return super()._advance(limits)
-        if limits is not self._limits:
-            self._limits, self._round_limits = limits, limit_rounds(limits)
-        count, residual, ended = run.run_rounds(self._rounds, self._round_limits)
+        count, residual, ended = run.run_rounds(self._rounds, limits)
         control.num_iterations, control.residual = count, residual if self._is_exact and not isnan(residual) else None
         self._num_rounds += count
         self.positions = run.positions
@@ -444,7 +447,7 @@ class LbfgsFirstState(HybridState):
     def _end_lbfgs_alone(self, run: LbfgsSweepState, residual: float, ended: int) -> None:
         """End the phase of L-BFGS alone, and continue with the choice between the methods."""
         method, control = self._prepared.method, self._control
-        control.solver_phases, self._is_lbfgs_alone, self._run = self._count_rounds(), False, None
+        control.solver_phases, self._is_lbfgs_alone, self._run = self._count_rounds(0.0), False, None
         self._point = method.read_point(self._step, run)
         self.positions = self._point.positions
         start = run.start_positions
@@ -455,20 +458,14 @@ class LbfgsFirstState(HybridState):
     @property
     def solver_phases(self) -> dict[str, tuple[int, float, float]]:
         """Iterations, cost in Newton steps and time [s] of each method so far."""
-        if self._is_lbfgs_alone:
-            self._control.solver_phases = self._count_rounds()
-        return self._control.read_phases()
+        if not self._is_lbfgs_alone:
+            return super().solver_phases
+        return self._count_rounds(self._control.clock() - self._control.phase_start)
 
-    def _count_rounds(self) -> dict[str, tuple[int, float, float]]:
-        """Count the iterations and the cost of L-BFGS alone."""
+    def _count_rounds(self, seconds: float) -> dict[str, tuple[int, float, float]]:
+        """Count the iterations and the cost of L-BFGS alone, which took this time [s]."""
         groups = int(self._rounds["num_iterations"][0]) / GROUP_ITERATIONS if self._num_rounds else 0.0
-        return {"lbfgs": (self._num_rounds, groups / self._prepared.method.newton_cost, 0.0)}
-
-
-def limit_rounds(limits: LoopLimits) -> LoopLimits:
-    """Return the limits of rounds of a solve with these limits."""
-    limit = limits.residual_limit if limits.residual_mode == RESIDUAL_EACH else 0.0
-    return LoopLimits(limits.max_iterations, limit, limits.residual_floor, limits.residual_mode)
+        return {"lbfgs": (self._num_rounds, groups / self._prepared.method.newton_cost, seconds)}
 
 
 class MeasuredRule(ShiftScheduleRule):
@@ -599,7 +596,6 @@ class HybridIteration:
         starts_with_lbfgs: whether a solve starts with compiled rounds of L-BFGS, which choose where to start.
         newton_cost: cost of a Newton step, in groups of L-BFGS iterations.
         sweep_cost: cost of a round of sweeps, in L-BFGS iterations; 0 if there are none.
-        starts_sweeping: whether a solve starts with sweeps.
     """
 
     can_identify_saddles: ClassVar[bool] = True
@@ -630,11 +626,18 @@ class HybridIteration:
         self.newton_cost = newton_cost / (GROUP_ITERATIONS * lbfgs_cost)
         constant, per_spring = _SWEEP_NANOSECONDS
         sweep_cost = ROUND_SWEEPS * (constant + per_spring * springs)
-        has_sweeps = self._sweep_engine is not None and bool((metric.free_diagonal <= _MAX_SWEEP_RATIO * inertia).all())
+
+        def has_ratios_up_to(limit: float) -> bool:
+            return bool((metric.free_diagonal <= limit * inertia).all())
+
+        has_sweeps = self._sweep_engine is not None and has_ratios_up_to(_MAX_SWEEP_RATIO)
         self.sweep_cost = 1 + round(sweep_cost / lbfgs_cost) if has_sweeps else 0
-        self.starts_sweeping = has_sweeps and bool((metric.free_diagonal <= _SWEEP_FIRST_RATIO * inertia).all())
+        near_fraction = _SOFT_NEAR_FRACTION if has_ratios_up_to(_SOFT_RATIO) else _NEAR_FRACTION
         check_cost = _COLLISION_CHECK_COST if objective.has_barriers else _ROUND_END_COST
-        rounds = init_rounds(self.newton_cost, check_cost, self.sweep_cost, starts_sweeping=self.starts_sweeping)
+        starts_sweeping = has_sweeps and has_ratios_up_to(_SWEEP_FIRST_RATIO)
+        rounds = init_rounds(
+            self.newton_cost, check_cost, self.sweep_cost, near_fraction, starts_sweeping=starts_sweeping
+        )
         self._initial_rounds = rounds.tobytes()
 
     @property
@@ -896,7 +899,7 @@ class MethodChoice:
         rival_gain = max(self._gains["predicted tensions"], self._gains["newton"])
         if rival_gain != self._rival_gain:
             rounds["rival_gain"] = self._rival_gain = rival_gain
-        count, residual, ended = self._run.run_rounds(rounds, limit_rounds(limits))
+        count, residual, ended = self._run.run_rounds(rounds, limits)
         done = int(rounds["num_iterations"][0]) - self._num_lbfgs_iterations
         self._control.add_phase("lbfgs", count, done / GROUP_ITERATIONS / self._method.newton_cost)
         if self._method.exact_lbfgs and not isnan(residual):

@@ -92,7 +92,9 @@ class LbfgsSweepState(CompiledAccelerationState):
         if (memory := engine.sweeps.update_packets(sweeps.sweep_memory, problem)) is not sweeps.sweep_memory:
             sweeps = sweeps._replace(sweep_memory=memory)
         self.start_positions = np.empty(guess.shape)
-        given = *self._step_arrays, self._external_force, as_kernel_array(problem.current_positions)
+        is_current = guess is problem.current_positions
+        current = self._step_arrays[-1] if is_current else as_kernel_array(problem.current_positions)
+        given = *self._step_arrays, self._external_force, current
         arrays = StepArrays(*given, self.start_positions, self.positions)
         self._round_arguments = *self._state, sweeps, arrays
         self._round_kernel, self._trace, self._start_kind = engine.round_kernel, engine.unpinned_trace, STARTS
