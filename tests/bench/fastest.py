@@ -58,6 +58,9 @@ MIN_COUNTED_SECONDS = 2e-4
 MAX_FIRST_PASS_RATIO = 3.0
 """A method is timed if its first-pass time is within this multiple of the least of the other methods, for at least one
 accuracy."""
+MAX_REPEATED_GROWTH = 1.5
+"""A first pass that exceeds its time is repeated if it has more than this multiple of the iterates of the one before:
+kernels are compiled at their first use, and may take all the time of a pass."""
 CONVERGED = StopRule(3000, rtol=1e-9)
 """End of the solve that finds the minimum to which a method converges."""
 NUM_RESAMPLES, CONFIDENCE = 2000, 0.95
@@ -166,10 +169,12 @@ def build_candidate(
         return None
     own_minimum = find_own_minimum(prepared, problem) if compute_measure is None else np.nan
     compute_measure = compute_measure or build_gap(problem, own_minimum)
-    limits = spec.max_iterations, spec.measurement.time_limit
-    found, is_in_time = find_first_iterates(prepared, problem, compute_measure, targets, *limits)
-    if not is_in_time:  # perhaps because kernels were compiled
-        found, _ = find_first_iterates(prepared, problem, compute_measure, targets, *limits)
+    limits, num_before = (spec.max_iterations, spec.measurement.time_limit), 0
+    while True:
+        found, num_done, is_in_time = find_first_iterates(prepared, problem, compute_measure, targets, *limits)
+        if is_in_time or num_done <= MAX_REPEATED_GROWTH * num_before:
+            break
+        num_before = num_done  # a kernel that was compiled may have taken the time
     numbers, seconds = ({target: pair[k] for target, pair in found.items()} for k in range(2))
     return CandidateSolve(spec.solver.name, prepared, numbers, seconds, own_minimum)
 
@@ -181,7 +186,7 @@ def find_first_iterates(
     targets: Sequence[float],
     max_iterations: int,
     time_limit: float,
-) -> tuple[dict[float, tuple[int, float]], bool]:
+) -> tuple[dict[float, tuple[int, float]], int, bool]:
     """Find the first iterates that satisfy the accuracies.
 
     Args:
@@ -193,9 +198,10 @@ def find_first_iterates(
         time_limit: limit of the processor time [s].
 
     Returns:
-        Number of the iterate and processor time [s] by accuracy, and whether the time limit was not exceeded.
+        Number of the iterate and processor time [s] by accuracy, number of iterates, and whether the time limit was not
+        exceeded.
     """
-    found, spent = dict[float, tuple[int, float]](), 0.0
+    found, spent, number = dict[float, tuple[int, float]](), 0.0, 0
     iterates = prepared.iterates(problem)
     for number in range(1, max_iterations + 1):
         began = thread_time()
@@ -205,7 +211,7 @@ def find_first_iterates(
         found |= {target: (number, spent) for target in targets if remaining <= target and target not in found}
         if len(found) == len(targets) or spent > time_limit or not np.isfinite(remaining):
             break
-    return found, spent <= time_limit
+    return found, number, spent <= time_limit
 
 
 def measure_solve_seconds(prepared: PreparedSolver, problem: StepProblem, num_iterations: int) -> float:
