@@ -147,10 +147,11 @@ _SWEEP_FIRST_RATIO = 500.0
 """Largest ratio of the diagonal of Q to the inertia at which a solve starts with sweeps: they then divide the objective
 by ten in about as many sweeps as a group has iterations."""
 
-_SOFT_RATIO, _NEAR_FRACTION, _SOFT_NEAR_FRACTION = 5e3, 5e-5, 5e-3
-"""Decrease of an iteration of L-BFGS, as a fraction of that since the start, at which sweeps may follow, and that up to
-a ratio of the diagonal of Q to the inertia. There the larger fraction saves 10 % of the time on the scenes of
-`configs/accuracy.yaml`; beyond it solves take 0.7 to 1.3 times as long, and often end in another minimum."""
+_SOFT_RATIO, _SOFT_NEAR_FRACTION, _NEAR_FRACTION = 5e3, 5e-3, 5e-5
+"""Largest ratio of the diagonal of Q to the inertia of soft springs, and the decrease of an iteration of L-BFGS, as a
+fraction of that since the start, at which sweeps may follow, for soft and for other springs. The larger fraction saves
+10 % of the time on the soft scenes of `configs/accuracy.yaml`; on others solves take 0.7 to 1.3 times as long, and
+often end in another minimum."""
 
 _ROUND_END_COST, _COLLISION_CHECK_COST = 0.1, 20.0
 """Costs of the end of a round and of a check for collisions, in iterations of L-BFGS: 0.01 to 0.4 for a call of the
