@@ -171,7 +171,8 @@ def build_rounds(
             return 0, residual(state, np.inf), REASON_ITERATIONS
         floor = max(limits.residual_floor, now.residual_floor)
         needs_last = limits.residual_mode == RESIDUAL_LAST
-        limits = LoopLimits(limits.max_iterations, limits.residual_limit, floor, RESIDUAL_EACH)
+        residual_limit = limits.residual_limit if limits.residual_mode == RESIDUAL_EACH else 0.0
+        limits = LoopLimits(limits.max_iterations, residual_limit, floor, RESIDUAL_EACH)
         exact_below = 2.0 * max(limits.residual_limit, floor)
         if now.initial_residual < 0.0:
             now.initial_residual = now.group_residual = now.segment_residual = residual(state, exact_below)

@@ -18,7 +18,13 @@ from springbench.solvers.iteration.descent_method import DescentPoint, PreparedD
 from springbench.solvers.iteration.phase_clock import measure_phases
 from springbench.solvers.kernels import descent_rounds
 from springbench.solvers.kernels.descent_rounds import REASON_SWITCH
-from springbench.solvers.kernels.iteration_loop import REASON_ITERATIONS, RESIDUAL_NEVER, LoopLimits
+from springbench.solvers.kernels.iteration_loop import (
+    REASON_ITERATIONS,
+    RESIDUAL_EACH,
+    RESIDUAL_LAST,
+    RESIDUAL_NEVER,
+    LoopLimits,
+)
 from springbench.solvers.linalg.cholesky import symbolic_factorisation
 from springbench.solvers.methods.newton import hybrid_newton
 from springbench.solvers.methods.newton.hybrid_newton import (
@@ -189,6 +195,15 @@ def test_sweeps_follow_earlier_in_soft_systems(ratio, fraction):
     method = prepare_method(1.0)
     factor = (method.metric.free_diagonal / method.inertia_diagonal[::3]).max() - 1.0
     assert prepare_method((ratio - 1.0) / factor).init_rounds()["near_fraction"] == fraction
+
+
+@pytest.mark.parametrize(("mode", "num_rounds"), [(RESIDUAL_LAST, 3), (RESIDUAL_EACH, 1)])
+def test_rounds_end_at_a_limit_of_the_residual_that_is_computed_in_each(mode, num_rounds):
+    iterate = descent_rounds.build_rounds(
+        lambda state, size: size, lambda state, exact_below: 0.1, lambda state: 0.0, lambda state: None
+    )
+    rounds = descent_rounds.init_rounds(4.0, 0.1).view(np.recarray)
+    assert iterate(None, rounds, LoopLimits(3, 0.5, 0.0, mode))[0] == num_rounds
 
 
 @pytest.mark.parametrize(("residual", "follow"), [(0.57, 0), (0.56, 1)])

@@ -20,8 +20,8 @@ minimum, groups of its iterations alternate with rounds of sweeps of vertex bloc
 (`springbench.solvers.methods.quasi_newton.sweep_rounds`). More rounds of sweeps follow as long as each reduces the
 residual to 0.56 of it. Near means that an iteration of L-BFGS decreases the objective by at most 5e-5 of the decrease
 so far, and by at most 5e-3 of it if no diagonal entry of Q exceeds 5000 times the inertia: sweeps far from a minimum
-lead to other, higher minima more often, the stiffer the springs. The sweeps come first if no entry exceeds 500 times
-the inertia; there are none if one exceeds the inertia over the square root of the machine epsilon.
+lead to other, higher minima, the more often the stiffer the springs are. The sweeps come first if no entry exceeds 500
+times the inertia; there are none if one exceeds the inertia over the square root of the machine epsilon.
 
 One rule decides which of the three methods continues: that with the largest decrease of the objective per cost in its
 last steps. A method that was not yet measured is credited with the decrease that L-BFGS leaves, extrapolated from its
@@ -207,9 +207,13 @@ def _needs_double_precision(metric: ResidualMetric) -> bool:
     No eigenvalue of Q relative to the inertia exceeds twice the largest ratio of their diagonals, as Q is diagonally
     dominant.
     """
-    system = metric.system
-    inertia = system.inertia_diagonal[system.free_vertices]
-    return bool((2.0 * metric.free_diagonal > _FLOAT32_CONDITION * inertia).any())
+    return _exceeds_ratio(metric, 0.5 * _FLOAT32_CONDITION)
+
+
+def _exceeds_ratio(metric: ResidualMetric, limit: float) -> bool:
+    """Return whether an entry of the diagonal of Q exceeds this multiple of the inertia."""
+    inertia = metric.system.inertia_diagonal[metric.system.free_vertices]
+    return bool((metric.free_diagonal > limit * inertia).any())
 
 
 class PreparedHybrid(PreparedDescent):
@@ -611,7 +615,7 @@ class HybridIteration:
         self.inertia_diagonal: NDArray[np.float64] = np.repeat(inertia, 3)
         self.factor = factor = objective.hessian_matrix.factor
         self._system_has_barriers = without_barriers(objective.system) is not objective.system
-        self.is_very_stiff = bool((metric.free_diagonal > _MAX_EXACT_RATIO * inertia).any())
+        self.is_very_stiff = _exceeds_ratio(metric, _MAX_EXACT_RATIO)
         has_exact_gradients = not self.is_very_stiff and not objective.has_barriers
         has_exact_gradients &= objective.system is without_vertex_contact(objective.system)
         self.exact_lbfgs = lbfgs if has_exact_gradients and is_double else None
@@ -627,15 +631,11 @@ class HybridIteration:
         self.newton_cost = newton_cost / (GROUP_ITERATIONS * lbfgs_cost)
         constant, per_spring = _SWEEP_NANOSECONDS
         sweep_cost = ROUND_SWEEPS * (constant + per_spring * springs)
-
-        def has_ratios_up_to(limit: float) -> bool:
-            return bool((metric.free_diagonal <= limit * inertia).all())
-
-        has_sweeps = self._sweep_engine is not None and has_ratios_up_to(_MAX_SWEEP_RATIO)
+        has_sweeps = self._sweep_engine is not None and not _exceeds_ratio(metric, _MAX_SWEEP_RATIO)
         self.sweep_cost = 1 + round(sweep_cost / lbfgs_cost) if has_sweeps else 0
-        near_fraction = _SOFT_NEAR_FRACTION if has_ratios_up_to(_SOFT_RATIO) else _NEAR_FRACTION
+        near_fraction = _NEAR_FRACTION if _exceeds_ratio(metric, _SOFT_RATIO) else _SOFT_NEAR_FRACTION
         check_cost = _COLLISION_CHECK_COST if objective.has_barriers else _ROUND_END_COST
-        starts_sweeping = has_sweeps and has_ratios_up_to(_SWEEP_FIRST_RATIO)
+        starts_sweeping = has_sweeps and not _exceeds_ratio(metric, _SWEEP_FIRST_RATIO)
         rounds = init_rounds(
             self.newton_cost, check_cost, self.sweep_cost, near_fraction, starts_sweeping=starts_sweeping
         )
