@@ -1,6 +1,6 @@
 """Rounds of a first-order method, ended when Newton's method is predicted to gain more.
 
-After each group of iterations, rounds of sweeps of another first-order method may follow, where there is one.
+After a segment of iterations, rounds of sweeps of another first-order method may follow, where there is one.
 
     q = D_k / D_(k-1),   remaining decrease = q D_k + q^2 D_k + ... = D_k q / (1 - q)
     switch if that per cost of Newton's method exceeds q D_k per round, i.e. if  1 / (1 - q) > cost of two Newton steps
@@ -46,6 +46,9 @@ REASON_SWITCH = 4
 GROUP_ITERATIONS = 10
 """Iterations of a group of rounds, whose decrease is measured."""
 
+SEGMENT_ITERATIONS = 8
+"""Iterations of a segment, after which sweeps may follow."""
+
 PROBE_ITERATIONS = 4
 """Iterations before the suitability of the method is assessed."""
 
@@ -59,8 +62,8 @@ _FAST_RESIDUAL_RATIO = 0.5
 _NEAR_ITERATIONS = 4
 """Smallest number of iterations over which that decrease is averaged."""
 
-_SWEEP_RESIDUAL_RATIO = 10.0**-0.25
-"""Largest ratio of residuals at which more sweeps follow: that of a tenth of the objective in two rounds."""
+_SWEEP_RESIDUAL_RATIO = 10.0**-0.2
+"""Largest ratio of residuals at which more sweeps follow: that of a hundredth of the objective in five rounds."""
 
 _NEWTON_STEPS = 2.0
 """Number of Newton steps that the remaining decrease is assumed to take."""
@@ -113,7 +116,7 @@ def _choose_sweeps(now, decrease, residual):
         count = now.num_iterations - now.late_start
         continues = decrease - now.late_decrease <= now.near_fraction * count * decrease
     now.is_sweeping = 1 if continues else 0
-    now.segment_end, now.segment_residual = now.num_iterations + GROUP_ITERATIONS, residual
+    now.segment_end, now.segment_residual = now.num_iterations + SEGMENT_ITERATIONS, residual
 
 
 @register_jitable(**jit_inner_options)
@@ -243,7 +246,7 @@ def init_rounds(
         starts_sweeping: whether the first round consists of sweeps.
     """
     initial = np.zeros(1, ROUND_STATE_DTYPE)
-    initial["group_end"] = initial["segment_end"] = GROUP_ITERATIONS
+    initial["group_end"], initial["segment_end"] = GROUP_ITERATIONS, SEGMENT_ITERATIONS
     initial["initial_residual"], initial["gain"], initial["gain_ratio"] = -1.0, np.inf, 1.0
     initial["newton_cost"], initial["check_cost"] = newton_cost, check_cost
     initial["sweep_cost"], initial["near_fraction"], initial["is_sweeping"] = sweep_cost, near_fraction, starts_sweeping

@@ -17,9 +17,9 @@ L-BFGS runs first. Its factor of Q is in float32, unless Q is so stiff that dire
 need no more, and iterations take 5 to 14 % less time (200 to 1100 vertices, one core with AVX-512). The residuals of
 L-BFGS then have relative errors of 1e-7, and of 7e-5 where six vertices have very different masses. A solve
 whose initial guess is the current positions starts at the lower one of these and the inertial prediction. Near the
-minimum, groups of its iterations alternate with rounds of sweeps of vertex block descent
+minimum, segments of eight iterations alternate with rounds of four sweeps of vertex block descent
 (`springbench.solvers.methods.quasi_newton.sweep_rounds`). More rounds of sweeps follow as long as each reduces the
-residual to 0.56 of it. Near means that an iteration of L-BFGS decreases the objective by at most 5e-5 of the decrease
+residual to 0.63 of it. Near means that an iteration of L-BFGS decreases the objective by at most 5e-5 of the decrease
 so far, and by at most 5e-3 of it if no diagonal entry of Q exceeds 5000 times the inertia: sweeps far from a minimum
 lead to other, higher minima, the more often the stiffer the springs are. The sweeps come first if no entry exceeds 500
 times the inertia; there are none if one exceeds the inertia over the square root of the machine epsilon.
@@ -74,7 +74,13 @@ from springbench.solvers.iteration.iterative_solver import SolverState
 from springbench.solvers.iteration.phase_clock import get_phase_clock
 from springbench.solvers.iteration.saddle_check import SaddleCheck
 from springbench.solvers.iteration.solver_info import Citation, SolverInfo
-from springbench.solvers.kernels.descent_rounds import GROUP_ITERATIONS, REASON_SWITCH, ROUND_STATE_DTYPE, init_rounds
+from springbench.solvers.kernels.descent_rounds import (
+    GROUP_ITERATIONS,
+    REASON_SWITCH,
+    ROUND_STATE_DTYPE,
+    SEGMENT_ITERATIONS,
+    init_rounds,
+)
 from springbench.solvers.kernels.iteration_loop import (
     NO_ITERATIONS,
     ONE_ITERATION,
@@ -889,7 +895,7 @@ class MethodChoice:
             self._run = self._method.start_lbfgs(step, self._point.positions)
             rounds["group_start"], rounds["group_end"] = 0.0, rounds["num_iterations"] + GROUP_ITERATIONS
             rounds["gain"], rounds["gain_ratio"], rounds["group_residual"] = np.inf, 1.0, 0.0
-            rounds["segment_end"], rounds["is_sweeping"] = rounds["group_end"], 0
+            rounds["segment_end"], rounds["is_sweeping"] = rounds["num_iterations"] + SEGMENT_ITERATIONS, 0
             rounds["late_start"], rounds["late_decrease"] = rounds["num_iterations"], 0.0
         if step.barrier_energies:  # each round is checked for collisions
             limits = limits._replace(max_iterations=1)

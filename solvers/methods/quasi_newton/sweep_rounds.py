@@ -1,6 +1,6 @@
 """Rounds of L-BFGS that alternate with sweeps of vertex block descent, without Python.
 
-    p <- S^5(L^10(p))     L an iteration of L-BFGS, S a sweep over all vertices
+    p <- S^4(L^8(p))     L an iteration of L-BFGS, S a sweep over all vertices
 
 This is a multiplicative composition of two nonlinear solvers (Brune, Knepley, Smith and Tu 2015, "Composing scalable
 nonlinear algebraic solvers"). L-BFGS, preconditioned by Q, reduces smooth errors in few iterations, but Q is much
@@ -34,7 +34,7 @@ from springbench.solvers.methods.vertex_block.vbd_sweeps import restart_sweeps, 
 from springbench.solvers.model.rounding_bound import EPS
 from springbench.solvers.simd.dot_products import ordered_dot
 
-ROUND_SWEEPS = 5
+ROUND_SWEEPS = 4
 """Sweeps of a round."""
 
 NOT_STARTED, MOVED = -2.0, -1.0
