@@ -618,13 +618,12 @@ class HybridIteration:
         self.factor = factor = objective.hessian_matrix.factor
         self._system_has_barriers = without_barriers(objective.system) is not objective.system
         self.is_very_stiff = _exceeds_ratio(metric, _MAX_EXACT_RATIO)
-        has_exact_gradients = not self.is_very_stiff and not objective.has_barriers
-        has_exact_gradients &= objective.system is without_vertex_contact(objective.system)
-        self.exact_lbfgs = lbfgs if has_exact_gradients else None
+        has_contact = objective.has_barriers or objective.system is not without_vertex_contact(objective.system)
+        self.exact_lbfgs = None if self.is_very_stiff or has_contact else lbfgs
         is_projective = objective.projective_indices.issuperset(objective.element_energy_indices)
         engine = lbfgs.acceleration_engine
         self._sweep_engine = engine if isinstance(engine, LbfgsSweepEngine) else None
-        self.starts_with_lbfgs = has_exact_gradients and is_projective and self._sweep_engine is not None
+        self.starts_with_lbfgs = is_projective and self._sweep_engine is not None and not has_contact
         springs, entries = len(objective.springs.stiffness), lbfgs.stats.get("nnz_factor", 0.0)
         constant, per_vertex, per_entry = _LBFGS_NANOSECONDS
         lbfgs_cost = constant + per_vertex * objective.system.num_vertices + per_entry * entries
