@@ -13,16 +13,16 @@ positions at the end of the previous step. If H(t) has no Cholesky factor, the s
 one is added: along unstable directions the step is longer, the closer that multiple is to the minimum (More and
 Sorensen 1983).
 
-L-BFGS runs first. Its factor of Q is in float32, unless Q is so stiff that directions would have no digit: directions
-need no more, and iterations take 5 to 14 % less time (200 to 1100 vertices, one core with AVX-512). The residuals of
-L-BFGS then have relative errors of 1e-7, and of 7e-5 where six vertices have very different masses. A solve
-whose initial guess is the current positions starts at the lower one of these and the inertial prediction. Near the
-minimum, segments of eight iterations alternate with rounds of four sweeps of vertex block descent
-(`springbench.solvers.methods.quasi_newton.sweep_rounds`). More rounds of sweeps follow as long as each reduces the
-residual to 0.63 of it. Near means that an iteration of L-BFGS decreases the objective by at most 5e-5 of the decrease
-so far, and by at most 5e-3 of it if no diagonal entry of Q exceeds 5000 times the inertia: sweeps far from a minimum
-lead to other, higher minima, the more often the stiffer the springs are. The sweeps come first if no entry exceeds 500
-times the inertia; there are none if one exceeds the inertia over the square root of the machine epsilon.
+L-BFGS runs first. Its factor of Q is in float32, unless Q is so stiff that directions would have no digit. Directions
+need no more digits, and an iteration takes 5 to 14 % less time (200 to 1100 vertices, one core with AVX-512). Residuals
+then have relative errors of 1e-7, for free bodies of up to 1e-4. A solve whose initial guess is the current positions
+starts at the lower one of these and the inertial prediction. Near the minimum, segments of eight iterations alternate
+with rounds of four sweeps of vertex block descent (`springbench.solvers.methods.quasi_newton.sweep_rounds`). More
+rounds of sweeps follow as long as each reduces the residual to 0.63 of it. Near means that an iteration of L-BFGS
+decreases the objective by at most 5e-5 of the decrease so far, and by at most 5e-3 of it if no diagonal entry of Q
+exceeds 5000 times the inertia: sweeps far from a minimum lead to other, higher minima, the more often the stiffer the
+springs are. The sweeps come first if no entry exceeds 500 times the inertia; there are none if one exceeds the inertia
+over the square root of the machine epsilon.
 
 One rule decides which of the three methods continues: that with the largest decrease of the objective per cost in its
 last steps. A method that was not yet measured is credited with the decrease that L-BFGS leaves, extrapolated from its
@@ -599,8 +599,8 @@ class HybridIteration:
         metric: norm of residuals.
         newton: the exact method.
         factor: factor of the Hessian.
-        exact_lbfgs: L-BFGS, if its gradients are those of the objective, and its residuals those of the metric except
-            for the precision of its factor; else None.
+        exact_lbfgs: L-BFGS, if its residuals are those of the metric, except for the precision of its factor; else
+            None.
         is_very_stiff: whether the gradients of L-BFGS have too much round-off (`_MAX_EXACT_RATIO`).
         starts_with_lbfgs: whether a solve starts with compiled rounds of L-BFGS, which choose where to start.
         newton_cost: cost of a Newton step, in groups of L-BFGS iterations.
