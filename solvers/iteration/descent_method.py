@@ -155,29 +155,32 @@ def guesses_current_positions(problem: StepProblem) -> bool:
     return guess is current or np.array_equal(guess, current)
 
 
-def lower_start_positions(step: StepObjective, p: Positions) -> Positions:
-    """Return given positions or the inertial prediction, if that is lower.
+def pick_lowest_positions(step: StepObjective, p: Positions, *others: Positions) -> Positions:
+    """Return the lowest of several positions.
 
-    The path to the prediction must also be free of collisions.
+    The path from the first to the others must also be free of collisions.
 
     Args:
         step: the objective.
-        p: positions (n, 3) [m], returned as the same array if the prediction is not lower.
+        p: positions (n, 3) [m], returned as the same array if no others are lower.
+        others: positions (n, 3) [m].
     """
-    fall = step.inertial_prediction()
-    if step.barrier_energies and step.max_step_size(p, fall - p) < 1.0:
-        return p
-    return fall if step.objective_change(p, fall)[0] < 0.0 else p
+    lowest = p
+    for q in others:
+        is_lower = step.objective_change(lowest, q)[0] < 0.0
+        if is_lower and (not step.barrier_energies or step.max_step_size(p, q - p) == 1.0):
+            lowest = q
+    return lowest
 
 
 def pick_lower_start(step: StepObjective, start: DescentPoint) -> DescentPoint:
-    """Return the lower one of a point and the inertial prediction, as `lower_start_positions` does.
+    """Return the lower one of a point and the inertial prediction, as `pick_lowest_positions` does.
 
     Args:
         step: the objective.
         start: the point, returned itself if the prediction is not lower.
     """
-    p = lower_start_positions(step, start.positions)
+    p = pick_lowest_positions(step, start.positions, step.inertial_prediction())
     return start if p is start.positions else DescentPoint(p, step.gradient(p))
 
 

@@ -105,9 +105,15 @@ def predict_positions(inertia_diagonal, target, force, pinned_vertices, pin_targ
         h = inertia_diagonal[v]
         for c in range(3):
             out[v, c] = target[v, c] + (force[v, c] / h if h > 0.0 else 0.0)
+    place_pinned(pinned_vertices, pin_targets, out)
+
+
+@jit_inner
+def place_pinned(pinned_vertices, pin_targets, p):
+    """Place the vertices of all pins (q,) on their targets (q, 3) [m]; p (n, 3) [m] is updated."""
     for q in range(len(pinned_vertices)):
         for c in range(3):
-            out[pinned_vertices[q], c] = pin_targets[q, c]
+            p[pinned_vertices[q], c] = pin_targets[q, c]
 
 
 @jit_kernel

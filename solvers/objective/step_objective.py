@@ -167,6 +167,12 @@ class StepObjective:
             self._pins = objective_kernels.ExactPins(self._exact_pins, targets)
         return self._pins
 
+    def inertial_target(self) -> Positions:
+        """Return the inertial target (n, 3) [m], with pinned vertices on their targets."""
+        out = np.array(self.problem.inertial_target, np.float64, order="C")
+        out[self.fixed_objective.pinned_vertices] = self.problem.pin_targets
+        return out
+
     def inertial_prediction(self) -> Positions:
         """Return the positions (n, 3) under inertia and external force alone.
 

@@ -39,7 +39,8 @@ METHODS = (
 )
 """The methods with compiled iterations."""
 MIN_SAMPLE_SECONDS = 30e-6
-MORE_ITERATIONS = 10
+MORE_ITERATIONS = 4
+"""Further iterations of the second solve; after more, some methods would be at round-off."""
 BATCH_SOLVES = 50
 """Solves one after the other of which the time is measured together, as in a simulation, whose caches are warm."""
 

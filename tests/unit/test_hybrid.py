@@ -14,7 +14,12 @@ from springbench.harness.config.config_loader import load_scene
 from springbench.harness.reference.exact_lengths import StationarityEvaluator
 from springbench.harness.scenes.scene_builder import build_scene
 from springbench.harness.simulation.time_loop import prepare, simulate_scene
-from springbench.solvers.iteration.descent_method import DescentPoint, PreparedDescent, ResidualMetric
+from springbench.solvers.iteration.descent_method import (
+    DescentPoint,
+    PreparedDescent,
+    ResidualMetric,
+    pick_lowest_positions,
+)
 from springbench.solvers.iteration.phase_clock import measure_phases
 from springbench.solvers.kernels import descent_rounds
 from springbench.solvers.kernels.descent_rounds import REASON_SWITCH
@@ -139,6 +144,33 @@ def test_the_first_segment_of_iterations_is_that_of_lbfgs(guess, monkeypatch):
         if numbers[-1] == len(path):
             break
     assert {4, 8} <= set(numbers)  # where the rule decides
+
+
+@pytest.mark.parametrize("name", ["current", "target", "prediction"])
+@pytest.mark.parametrize("is_compiled", [True, False])
+def test_a_solve_from_the_current_positions_starts_at_the_lowest_of_three_points(name, is_compiled):
+    """Soft springs let a flat cloth fall; stiff ones resist motion in its plane, but no small one out of it."""
+    given = stiff(0.1 if name == "prediction" else 1e4)
+    if name != "prediction":
+        pull = given.external_force[:, [1, 0, 2]]
+        moved = 2.0 * given.inertial_target if name == "current" else given.inertial_target + np.array([0.0, 1e-3, 0.0])
+        given = replace(given, external_force=pull, inertial_target=moved)
+    prepared = HybridNewton().prepare(given.system)
+    assert isinstance(prepared, PreparedHybrid)
+    step = StepObjective(prepared.fixed_objective, given)
+    points = {
+        "current": step.apply_exact_pins(given.current_positions),
+        "target": step.inertial_target(),
+        "prediction": step.inertial_prediction(),
+    }
+    assert min(points, key=lambda one: given.value(points[one])) == name
+    if is_compiled:
+        run = prepared.method.prepare_lbfgs(given, given.current_positions)
+        run.start_lowest(prepared.method.init_rounds())
+        found = run.start_positions
+    else:
+        found = pick_lowest_positions(step, points["current"], points["target"], points["prediction"])
+    np.testing.assert_array_equal(found, points[name])
 
 
 def sweep_with_restarts(given: StepProblem, p: Positions, num_sweeps: int) -> Positions:

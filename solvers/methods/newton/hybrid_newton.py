@@ -16,13 +16,13 @@ Sorensen 1983).
 L-BFGS runs first. Its factor of Q is in float32, unless Q is so stiff that directions would have no digit. Directions
 need no more digits, and an iteration takes 5 to 14 % less time (200 to 1100 vertices, one core with AVX-512). Residuals
 then have relative errors of 1e-7, for free bodies of up to 1e-4. A solve whose initial guess is the current positions
-starts at the lower one of these and the inertial prediction. Near the minimum, segments of eight iterations alternate
-with rounds of four sweeps of vertex block descent (`springbench.solvers.methods.quasi_newton.sweep_rounds`). More
-rounds of sweeps follow as long as each reduces the residual to 0.63 of it. Near means that an iteration of L-BFGS
-decreases the objective by at most 5e-5 of the decrease so far, and by at most 5e-3 of it if no diagonal entry of Q
-exceeds 5000 times the inertia: sweeps far from a minimum lead to other, higher minima, the more often the stiffer the
-springs are. The sweeps come first if no entry exceeds 500 times the inertia; there are none if one exceeds the inertia
-over the square root of the machine epsilon.
+starts at the lowest of these, the inertial target (motion without forces) and the inertial prediction (motion without
+springs). Near the minimum, segments of eight iterations alternate with rounds of four sweeps of vertex block descent
+(`springbench.solvers.methods.quasi_newton.sweep_rounds`). More rounds of sweeps follow as long as each reduces the
+residual to 0.63 of it. Near means that an iteration of L-BFGS decreases the objective by at most 5e-5 of the decrease
+so far, and by at most 5e-3 of it if no diagonal entry of Q exceeds 5000 times the inertia: sweeps far from a minimum
+lead to other, higher minima, the more often the stiffer the springs are. The sweeps come first if no entry exceeds 500
+times the inertia; there are none if one exceeds the inertia over the square root of the machine epsilon.
 
 One rule decides which of the three methods continues: that with the largest decrease of the objective per cost in its
 last steps. A method that was not yet measured is credited with the decrease that L-BFGS leaves, extrapolated from its
@@ -67,7 +67,7 @@ from springbench.solvers.iteration.descent_method import (
     guesses_current_positions,
     has_active_barrier,
     inner_product,
-    lower_start_positions,
+    pick_lowest_positions,
 )
 from springbench.solvers.iteration.idle_contact import skip_idle_contact
 from springbench.solvers.iteration.iterative_solver import SolverState
@@ -408,7 +408,7 @@ class LbfgsFirstState(HybridState):
 
     def compute_start_residual(self) -> float | None:
         """Start L-BFGS and return the residual [J^(1/2)] at the initial guess, if its residuals are exact."""
-        return self._prepare_run().start_lower(self._rounds) if self._is_exact else None
+        return self._prepare_run().start_lowest(self._rounds) if self._is_exact else None
 
     def _prepare_run(self) -> LbfgsSweepState:
         """Prepare L-BFGS, which the first rounds start."""
@@ -445,9 +445,10 @@ class LbfgsFirstState(HybridState):
 
     def residual(self) -> float:
         """Return the residual [J^(1/2)] at the current positions."""
-        if self._run is not None and self._is_exact and self._control.residual is None:
-            self._control.residual = self._run.run_rounds(self._rounds, NO_ITERATIONS)[1]
-        return super().residual()
+        found = self._control.residual
+        if found is None and self._run is not None and self._is_exact:
+            found = self._control.residual = self._run.run_rounds(self._rounds, NO_ITERATIONS)[1]
+        return super().residual() if found is None else found
 
     def _current_point(self) -> DescentPoint:
         return super()._current_point() if self._run is None else DescentPoint(self.positions, self._run.gradient())
@@ -674,12 +675,12 @@ class HybridIteration:
 
         Args:
             step: objective of the step.
-            p: positions (n, 3) [m]; if the step's guess is its current positions, the inertial prediction replaces
-                them where it is lower.
+            p: initial guess (n, 3) [m]; if it is the current positions, the inertial target or the inertial prediction
+                replaces them where that is lower.
             control: limits of the next iterations, read for each point; counts and costs are recorded there.
         """
         if guesses_current_positions(step.problem):
-            p = lower_start_positions(step, p)
+            p = pick_lowest_positions(step, p, step.inertial_target(), step.inertial_prediction())
         yield from self.continue_from(step, DescentPoint(p, NO_GRADIENT), control)
 
     def continue_from(
@@ -736,7 +737,7 @@ class HybridIteration:
             guess: initial guess (n, 3) [m].
         """
         assert self._sweep_engine is not None
-        return self._sweep_engine.prepare_state(self._without_barriers(problem), guess)
+        return LbfgsSweepState(self._sweep_engine, self._without_barriers(problem), guess)
 
     def _without_barriers(self, problem: StepProblem) -> StepProblem:
         return ignore_barriers(problem) if self._system_has_barriers else problem

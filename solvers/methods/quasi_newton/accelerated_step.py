@@ -24,7 +24,7 @@ from springbench.solvers.kernels.accelerated_descent import (
 from springbench.solvers.kernels.edge_elements import sum_squared_stretch
 from springbench.solvers.kernels.iteration_loop import build_compiled_loop
 from springbench.solvers.kernels.local_global_iteration import IterationPlan
-from springbench.solvers.kernels.objective_kernels import predict_positions
+from springbench.solvers.kernels.objective_kernels import place_pinned, predict_positions
 from springbench.solvers.kernels.spring_local_step import SpringPackets, squared_norm
 from springbench.solvers.kernels.spring_objective import ObjectiveWeights, value_and_descent
 from springbench.solvers.kernels.step_setup import VertexRows, read_positions, write_positions, write_right_hand_side
@@ -106,8 +106,10 @@ def iterate_from(step, window, negative_pairs, target, force, pin_targets, num_i
 
 
 @jit_inner
-def start_lower_solve(step, window, target, force, pin_targets, guess, external_force, current, measures_guess, out):
-    """Start the solve at a guess, or at the inertial prediction if that is lower.
+def start_lowest_solve(step, window, target, force, pin_targets, guess, external_force, current, measures_guess, out):
+    """Start the solve at the guess or, if this is the current positions, at the lowest of several points.
+
+    The others are the inertial target and the inertial prediction.
 
     Args:
         step: data of the system; its vectors and objective values are overwritten.
@@ -117,8 +119,7 @@ def start_lower_solve(step, window, target, force, pin_targets, guess, external_
         pin_targets: target positions of the pins (q, 3) [m].
         guess: initial guess (n, 3) [m].
         external_force: force of the inertial prediction (n, 3) [N].
-        current: positions at the start of the step (n, 3) [m]; a guess that differs from them is not compared with the
-            inertial prediction.
+        current: positions at the start of the step (n, 3) [m].
         measures_guess: whether the residual at the guess is computed.
         out: output (n, 3) [m], the positions at the start.
 
@@ -130,25 +131,43 @@ def start_lower_solve(step, window, target, force, pin_targets, guess, external_
     if measures_guess:
         _start_window(step, window)
         at_guess = compute_window_residual((step, window))
+    _keep_trial(window)
     is_lower = False
     if not _differs(guess.flat, current.flat, guess.size):
-        for k in range(size):
-            window.position[k], window.descent[k] = window.trial_position[k], window.trial_descent[k]
+        for v in range(len(out)):
+            for c in range(3):
+                out[v, c] = target[v, c]
+        place_pinned(rows.pinned_vertices, pin_targets, out)
+        is_lower = _keep_lower(step, window, pin_targets, out)
         predict_positions(rows.inertia_diagonal, target, external_force, rows.pinned_vertices, pin_targets, out)
-        write_positions(rows, out, pin_targets, window.trial_position)
-        if _differs(window.trial_position, window.position, size):
-            there = evaluate_trial(step, window)
-            is_lower = there < step.objective_values[0]
-            if is_lower:
-                step.objective_values[0] = there
-            else:
-                for k in range(size):
-                    window.trial_position[k], window.trial_descent[k] = window.position[k], window.descent[k]
-    if not is_lower:
-        read_positions(rows, window.trial_position, out)
+        is_lower |= _keep_lower(step, window, pin_targets, out)
+    for k in range(size):
+        window.trial_position[k], window.trial_descent[k] = window.position[k], window.descent[k]
+    read_positions(rows, window.trial_position, out)
     if is_lower or not measures_guess:
         _start_window(step, window)
     return at_guess
+
+
+@jit_inner
+def _keep_lower(step, window, pin_targets, p):
+    """Keep positions p (n, 3) [m] as the current point if they are lower; return whether they are."""
+    write_positions(step.vertex_rows, p, pin_targets, window.trial_position)
+    if not _differs(window.trial_position, window.position, len(window.direction)):
+        return False
+    there = evaluate_trial(step, window)
+    if not there < step.objective_values[0]:
+        return False
+    step.objective_values[0] = there
+    _keep_trial(window)
+    return True
+
+
+@jit_inner
+def _keep_trial(window):
+    """Copy the trial point to the current point."""
+    for k in range(len(window.direction)):
+        window.position[k], window.descent[k] = window.trial_position[k], window.trial_descent[k]
 
 
 @jit_inner

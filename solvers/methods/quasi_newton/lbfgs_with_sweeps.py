@@ -56,17 +56,6 @@ class LbfgsSweepEngine(CompiledEngine):
         """
         return LbfgsSweepState(self, problem, initial_guess).start_at_guess()
 
-    def prepare_state(self, problem: StepProblem, initial_guess: Positions) -> LbfgsSweepState:
-        """Prepare a solve, which its first rounds start.
-
-        If the step's guess is its current positions, it starts at the lower one of these and the inertial prediction.
-
-        Args:
-            problem: step whose objective is minimised.
-            initial_guess: positions (n, 3) [m], not modified.
-        """
-        return LbfgsSweepState(self, problem, initial_guess)
-
     def _allocate_memory(self) -> AccelerationMemory:
         made = self.sweeps
         return *super()._allocate_memory(), SweepStep(made.vertex_rows, made.allocate_memory())
@@ -80,17 +69,19 @@ class LbfgsSweepState(CompiledAccelerationState):
     """
 
     def __init__(self, engine: LbfgsSweepEngine, problem: StepProblem, guess: Positions) -> None:
-        """Prepare a solve.
+        """Prepare a solve, which its first rounds start.
+
+        The start is the lowest of several points (`accelerated_step.start_lowest_solve`).
 
         Args:
             engine: iteration of the system.
             problem: step whose objective is minimised.
-            guess: initial guess (n, 3) [m].
+            guess: initial guess (n, 3) [m], not modified.
         """
         super().__init__(engine, problem, guess)
         _, _, sweeps = self._memory
-        if (memory := engine.sweeps.update_packets(sweeps.sweep_memory, problem)) is not sweeps.sweep_memory:
-            sweeps = sweeps._replace(sweep_memory=memory)
+        if engine.has_edges:
+            sweeps = sweeps._replace(sweep_memory=engine.sweeps.update_packets(sweeps.sweep_memory, problem))
         self.start_positions = np.empty(guess.shape)
         is_current = guess is problem.current_positions
         current = self._step_arrays[-1] if is_current else as_kernel_array(problem.current_positions)
@@ -105,8 +96,8 @@ class LbfgsSweepState(CompiledAccelerationState):
         self._start_kind = CONTINUES
         return super().start_at_guess()
 
-    def start_lower(self, rounds: NDArray[Any]) -> float:
-        """Start the solve at the lower one of the guess and the inertial prediction.
+    def start_lowest(self, rounds: NDArray[Any]) -> float:
+        """Start the solve at the lowest of several points, without rounds.
 
         Args:
             rounds: state of the rounds (1,), updated.

@@ -26,7 +26,7 @@ from springbench.solvers.methods.quasi_newton.accelerated_step import (
     compute_window_residual,
     evaluate_trial,
     solve_trial,
-    start_lower_solve,
+    start_lowest_solve,
     step_state,
 )
 from springbench.solvers.methods.vertex_block.vbd import SweepMemory
@@ -65,8 +65,7 @@ class StepArrays(NamedTuple):
         pin_targets: target positions of the pins (q, 3) [m].
         guess: initial guess (n, 3) [m].
         external_force: force of the inertial prediction (n, 3) [N].
-        current: positions at the start of the step (n, 3) [m]; a guess that differs from them is not compared with the
-            inertial prediction.
+        current: positions at the start of the step (n, 3) [m].
         start: output, positions at the start (n, 3) [m].
         positions: output, positions (n, 3) [m].
     """
@@ -196,7 +195,7 @@ def run_sweep_rounds(
     at_guess, count, residual, ended = np.nan, 0, np.nan, REASON_ITERATIONS
     if start != CONTINUES:
         sweeps.sweep_memory.sweep_scratch.omega[0] = NOT_STARTED
-        at_guess = start_lower_solve(
+        at_guess = start_lowest_solve(
             step,
             window,
             arrays.target,

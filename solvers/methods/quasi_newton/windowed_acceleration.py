@@ -199,7 +199,8 @@ class CompiledEngine:
         self._shares = ObjectiveWeights.from_packets(
             bundles, plan.anchor_stiffness, self._rows.row_of_vertex[pins.vertices[pins.exact_mask]]
         )
-        self.has_energy_scales = bool(self.spring_form.form_builders) or self.spring_form.has_edges
+        self.has_edges = self.spring_form.has_edges
+        self.has_energy_scales = self.has_edges or bool(self.spring_form.form_builders)
         self.free_memory: list[AccelerationMemory] = []
         self.start_solve, self.run_solve, self.read_positions = (
             TypedKernel(accelerated_step.start_solve),
@@ -254,8 +255,8 @@ class CompiledAccelerationState(CompiledState, AcceleratedState):
         """
         self._engine, self._memory, parts = engine, engine.take_memory(), engine.spring_form
         step, window = self._memory[:2]
-        if (packets := parts.update_edges(step.spring_packets, problem)) is not step.spring_packets:
-            step = step._replace(spring_packets=packets)
+        if engine.has_edges:
+            step = step._replace(spring_packets=parts.update_edges(step.spring_packets, problem))
         self._state = step, window
         self._external_force = external = as_kernel_array(problem.external_force)
         force = parts.compute_force(problem) if parts.form_builders else external
