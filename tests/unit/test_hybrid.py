@@ -580,3 +580,7 @@ def test_a_very_stiff_system_takes_gradients_from_the_objective(ratio, is_very_s
     run.step_state()
     wanted = step.gradient(run.positions) if is_very_stiff else run.gradient()
     np.testing.assert_array_equal(method.read_point(step, run).gradient, wanted)
+    solve = prepared.init_state(given, given.initial_guess)
+    solve.step_state()
+    wanted_residual = method.metric.residual(step.gradient(solve.positions))
+    assert solve.residual() == pytest.approx(wanted_residual, rel=1e-14 if is_very_stiff else 1e-6)

@@ -451,7 +451,9 @@ class LbfgsFirstState(HybridState):
         return super().residual() if found is None else found
 
     def _current_point(self) -> DescentPoint:
-        return super()._current_point() if self._run is None else DescentPoint(self.positions, self._run.gradient())
+        if self._run is None:
+            return super()._current_point()
+        return self._prepared.method.read_point(self._step, self._run)
 
     def _end_lbfgs_alone(self, run: LbfgsSweepState, residual: float, ended: int) -> None:
         """End the phase of L-BFGS alone, and continue with the choice between the methods."""
