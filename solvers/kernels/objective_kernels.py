@@ -110,7 +110,13 @@ def predict_positions(inertia_diagonal, target, force, pinned_vertices, pin_targ
 
 @jit_inner
 def place_pinned(pinned_vertices, pin_targets, p):
-    """Place the vertices of all pins (q,) on their targets (q, 3) [m]; p (n, 3) [m] is updated."""
+    """Place pinned vertices on their targets.
+
+    Args:
+        pinned_vertices: vertices of all pins (q,).
+        pin_targets: their targets (q, 3) [m].
+        p: positions (n, 3) [m], updated.
+    """
     for q in range(len(pinned_vertices)):
         for c in range(3):
             p[pinned_vertices[q], c] = pin_targets[q, c]

@@ -107,9 +107,9 @@ def iterate_from(step, window, negative_pairs, target, force, pin_targets, num_i
 
 @jit_inner
 def start_lowest_solve(step, window, target, force, pin_targets, guess, external_force, current, measures_guess, out):
-    """Start the solve at the guess or, if this is the current positions, at the lowest of several points.
+    """Start the solve at the lowest of several points.
 
-    The others are the inertial target and the inertial prediction.
+    These are the guess and, if it is the current positions, the inertial target and the inertial prediction.
 
     Args:
         step: data of the system; its vectors and objective values are overwritten.
