@@ -156,13 +156,13 @@ def guesses_current_positions(problem: StepProblem) -> bool:
 
 
 def pick_lowest_positions(step: StepObjective, p: Positions, *others: Positions) -> Positions:
-    """Return the lowest of several positions.
+    """Return those of several positions that have the lowest objective.
 
-    The path from the first to the others must also be free of collisions.
+    The displacement from the first to the others must also be collision-free.
 
     Args:
         step: the objective.
-        p: positions (n, 3) [m], returned as the same array if no others are lower.
+        p: positions (n, 3) [m], returned as the same array if no others have a lower objective.
         others: positions (n, 3) [m].
     """
     lowest = p

@@ -575,7 +575,7 @@ def test_a_very_stiff_system_takes_gradients_from_the_objective(ratio, is_very_s
     assert isinstance(prepared, PreparedHybrid)
     method, step = prepared.method, StepObjective(prepared.fixed_objective, given)
     assert method.is_very_stiff == is_very_stiff
-    assert (method.exact_lbfgs is None) == is_very_stiff
+    assert (method.residual_lbfgs is None) == is_very_stiff
     run = method.start_lbfgs(step, given.initial_guess)
     run.step_state()
     wanted = step.gradient(run.positions) if is_very_stiff else run.gradient()

@@ -13,16 +13,17 @@ positions at the end of the previous step. If H(t) has no Cholesky factor, the s
 one is added: along unstable directions the step is longer, the closer that multiple is to the minimum (More and
 Sorensen 1983).
 
-L-BFGS runs first. Its factor of Q is in float32, unless Q is so stiff that directions would have no digit. Directions
-need no more digits, and an iteration takes 5 to 14 % less time (200 to 1100 vertices, one core with AVX-512). Residuals
-then have relative errors of 1e-7, for free bodies of up to 1e-4. A solve whose initial guess is the current positions
-starts at the lowest of these, the inertial target (motion without forces) and the inertial prediction (motion without
-springs). Near the minimum, segments of eight iterations alternate with rounds of four sweeps of vertex block descent
-(`springbench.solvers.methods.quasi_newton.sweep_rounds`). More rounds of sweeps follow as long as each reduces the
-residual to 0.63 of it. Near means that an iteration of L-BFGS decreases the objective by at most 5e-5 of the decrease
-so far, and by at most 5e-3 of it if no diagonal entry of Q exceeds 5000 times the inertia: sweeps far from a minimum
-lead to other, higher minima, the more often the stiffer the springs are. The sweeps come first if no entry exceeds 500
-times the inertia; there are none if one exceeds the inertia over the square root of the machine epsilon.
+L-BFGS runs first. Its factor of Q is in float32, unless Q is so stiff that directions would have no correct digit: an
+iteration takes 5 to 14 % less time (200 to 1100 vertices, one core with AVX-512), and directions need no more digits.
+Residuals then have relative errors of 1e-7, for free bodies of up to 1e-4. A solve whose initial guess is the current
+positions starts where the objective is lowest: there, at the inertial target (motion without forces) or at the inertial
+prediction (motion without springs). Near the minimum, segments of eight iterations alternate with rounds of four sweeps
+of vertex block descent (`springbench.solvers.methods.quasi_newton.sweep_rounds`). More rounds of sweeps follow as long
+as each reduces the residual to 0.63 of it. Near means that an iteration of L-BFGS decreases the objective by at most
+5e-5 of the decrease so far, and by at most 5e-3 of it if no diagonal entry of Q exceeds 5000 times the inertia: sweeps
+far from a minimum lead to other, higher minima, the more often the stiffer the springs are. The sweeps come first if no
+entry exceeds 500 times the inertia; there are none if one exceeds the inertia over the square root of the machine
+epsilon.
 
 One rule decides which of the three methods continues: that with the largest decrease of the objective per cost in its
 last steps. A method that was not yet measured is credited with the decrease that L-BFGS leaves, extrapolated from its
@@ -245,7 +246,7 @@ class PreparedHybrid(PreparedDescent):
             problem: step whose objective is minimised.
             p: positions (n, 3) [m].
         """
-        lbfgs = self.method.exact_lbfgs
+        lbfgs = self.method.residual_lbfgs
         return lbfgs.residual_at(ignore_barriers(problem), p) if lbfgs else super().residual_at(problem, p)
 
 
@@ -403,12 +404,12 @@ class LbfgsFirstState(HybridState):
 
     def _start_points(self) -> None:
         """Begin the phase of L-BFGS, whose first round starts the solve."""
-        self._is_exact = self._prepared.method.exact_lbfgs is not None  # L-BFGS's residuals are those of the metric
+        self._uses_lbfgs_residuals = self._prepared.method.residual_lbfgs is not None
         self._control.begin_phase("lbfgs")
 
     def compute_start_residual(self) -> float | None:
-        """Start L-BFGS and return the residual [J^(1/2)] at the initial guess, if its residuals are exact."""
-        return self._prepare_run().start_lowest(self._rounds) if self._is_exact else None
+        """Start L-BFGS and return the residual [J^(1/2)] at the initial guess, if its residuals are used."""
+        return self._prepare_run().start_lowest(self._rounds) if self._uses_lbfgs_residuals else None
 
     def _prepare_run(self) -> LbfgsSweepState:
         """Prepare L-BFGS, which the first rounds start."""
@@ -432,7 +433,8 @@ class LbfgsFirstState(HybridState):
             self._end_lbfgs_alone(run, np.inf, REASON_ITERATIONS)
             return super()._advance(limits)
         count, residual, ended = run.run_rounds(self._rounds, limits)
-        control.num_iterations, control.residual = count, residual if self._is_exact and not isnan(residual) else None
+        is_known = self._uses_lbfgs_residuals and not isnan(residual)
+        control.num_iterations, control.residual = count, residual if is_known else None
         self._num_rounds += count
         self.positions = run.positions
         if ended != REASON_ITERATIONS and self._is_lbfgs_done(residual, ended):
@@ -446,7 +448,7 @@ class LbfgsFirstState(HybridState):
     def residual(self) -> float:
         """Return the residual [J^(1/2)] at the current positions."""
         found = self._control.residual
-        if found is None and self._run is not None and self._is_exact:
+        if found is None and self._run is not None and self._uses_lbfgs_residuals:
             found = self._control.residual = self._run.run_rounds(self._rounds, NO_ITERATIONS)[1]
         return super().residual() if found is None else found
 
@@ -602,8 +604,8 @@ class HybridIteration:
         metric: norm of residuals.
         newton: the exact method.
         factor: factor of the Hessian.
-        exact_lbfgs: L-BFGS, if its residuals are those of the metric, except for the precision of its factor; else
-            None.
+        residual_lbfgs: L-BFGS, if its residuals are used, which are those of the metric in the precision of its
+            factor; else None.
         is_very_stiff: whether the gradients of L-BFGS have too much round-off (`_MAX_EXACT_RATIO`).
         starts_with_lbfgs: whether a solve starts with compiled rounds of L-BFGS, which choose where to start.
         newton_cost: cost of a Newton step, in groups of L-BFGS iterations.
@@ -622,7 +624,7 @@ class HybridIteration:
         self._system_has_barriers = without_barriers(objective.system) is not objective.system
         self.is_very_stiff = _exceeds_ratio(metric, _MAX_EXACT_RATIO)
         has_contact = objective.has_barriers or objective.system is not without_vertex_contact(objective.system)
-        self.exact_lbfgs = None if self.is_very_stiff or has_contact else lbfgs
+        self.residual_lbfgs = None if self.is_very_stiff or has_contact else lbfgs
         is_projective = objective.projective_indices.issuperset(objective.element_energy_indices)
         engine = lbfgs.acceleration_engine
         self._sweep_engine = engine if isinstance(engine, LbfgsSweepEngine) else None
@@ -678,7 +680,7 @@ class HybridIteration:
         Args:
             step: objective of the step.
             p: initial guess (n, 3) [m]; if it is the current positions, the inertial target or the inertial prediction
-                replaces them where that is lower.
+                replaces them if its objective is lower.
             control: limits of the next iterations, read for each point; counts and costs are recorded there.
         """
         if guesses_current_positions(step.problem):
@@ -907,7 +909,7 @@ class MethodChoice:
         count, residual, ended = self._run.run_rounds(rounds, limits)
         done = int(rounds["num_iterations"][0]) - self._num_lbfgs_iterations
         self._control.add_phase("lbfgs", count, done / GROUP_ITERATIONS / self._method.newton_cost)
-        if self._method.exact_lbfgs and not isnan(residual):
+        if self._method.residual_lbfgs and not isnan(residual):
             point, self._control.residual = DescentPoint(self._run.positions.copy(), NO_GRADIENT), residual
         else:
             point = self._method.read_point(step, self._run)

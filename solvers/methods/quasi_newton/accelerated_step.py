@@ -107,9 +107,9 @@ def iterate_from(step, window, negative_pairs, target, force, pin_targets, num_i
 
 @jit_inner
 def start_lowest_solve(step, window, target, force, pin_targets, guess, external_force, current, measures_guess, out):
-    """Start the solve at the lowest of several points.
+    """Start the solve at the point with the lowest objective.
 
-    These are the guess and, if it is the current positions, the inertial target and the inertial prediction.
+    The points are the guess and, if it is the current positions, the inertial target and the inertial prediction.
 
     Args:
         step: data of the system; its vectors and objective values are overwritten.
@@ -131,16 +131,16 @@ def start_lowest_solve(step, window, target, force, pin_targets, guess, external
     if measures_guess:
         _start_window(step, window)
         at_guess = compute_window_residual((step, window))
-    _keep_trial(window)
+    _copy_trial(window)
     is_lower = False
     if not _differs(guess.flat, current.flat, guess.size):
         for v in range(len(out)):
             for c in range(3):
                 out[v, c] = target[v, c]
         place_pinned(rows.pinned_vertices, pin_targets, out)
-        is_lower = _keep_lower(step, window, pin_targets, out)
+        is_lower = _move_if_lower(step, window, pin_targets, out)
         predict_positions(rows.inertia_diagonal, target, external_force, rows.pinned_vertices, pin_targets, out)
-        is_lower |= _keep_lower(step, window, pin_targets, out)
+        is_lower |= _move_if_lower(step, window, pin_targets, out)
     for k in range(size):
         window.trial_position[k], window.trial_descent[k] = window.position[k], window.descent[k]
     read_positions(rows, window.trial_position, out)
@@ -150,8 +150,8 @@ def start_lowest_solve(step, window, target, force, pin_targets, guess, external
 
 
 @jit_inner
-def _keep_lower(step, window, pin_targets, p):
-    """Keep positions p (n, 3) [m] as the current point if they are lower; return whether they are."""
+def _move_if_lower(step, window, pin_targets, p):
+    """Move to positions p (n, 3) [m] if they lower the objective; return whether they do."""
     write_positions(step.vertex_rows, p, pin_targets, window.trial_position)
     if not _differs(window.trial_position, window.position, len(window.direction)):
         return False
@@ -159,12 +159,12 @@ def _keep_lower(step, window, pin_targets, p):
     if not there < step.objective_values[0]:
         return False
     step.objective_values[0] = there
-    _keep_trial(window)
+    _copy_trial(window)
     return True
 
 
 @jit_inner
-def _keep_trial(window):
+def _copy_trial(window):
     """Copy the trial point to the current point."""
     for k in range(len(window.direction)):
         window.position[k], window.descent[k] = window.trial_position[k], window.trial_descent[k]

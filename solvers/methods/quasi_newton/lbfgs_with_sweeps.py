@@ -71,7 +71,7 @@ class LbfgsSweepState(CompiledAccelerationState):
     def __init__(self, engine: LbfgsSweepEngine, problem: StepProblem, guess: Positions) -> None:
         """Prepare a solve, which its first rounds start.
 
-        The start is the lowest of several points (`accelerated_step.start_lowest_solve`).
+        Its start is chosen by `accelerated_step.start_lowest_solve`.
 
         Args:
             engine: iteration of the system.
@@ -80,7 +80,7 @@ class LbfgsSweepState(CompiledAccelerationState):
         """
         super().__init__(engine, problem, guess)
         _, _, sweeps = self._memory
-        if engine.has_edges:
+        if engine.spring_form.has_edges:
             sweeps = sweeps._replace(sweep_memory=engine.sweeps.update_packets(sweeps.sweep_memory, problem))
         self.start_positions = np.empty(guess.shape)
         is_current = guess is problem.current_positions
@@ -97,7 +97,7 @@ class LbfgsSweepState(CompiledAccelerationState):
         return super().start_at_guess()
 
     def start_lowest(self, rounds: NDArray[Any]) -> float:
-        """Start the solve at the lowest of several points, without rounds.
+        """Start the solve at the point with the lowest objective, without rounds.
 
         Args:
             rounds: state of the rounds (1,), updated.

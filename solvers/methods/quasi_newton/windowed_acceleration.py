@@ -199,8 +199,7 @@ class CompiledEngine:
         self._shares = ObjectiveWeights.from_packets(
             bundles, plan.anchor_stiffness, self._rows.row_of_vertex[pins.vertices[pins.exact_mask]]
         )
-        self.has_edges = self.spring_form.has_edges
-        self.has_energy_scales = self.has_edges or bool(self.spring_form.form_builders)
+        self.has_energy_scales = bool(self.spring_form.form_builders) or self.spring_form.has_edges
         self.free_memory: list[AccelerationMemory] = []
         self.start_solve, self.run_solve, self.read_positions = (
             TypedKernel(accelerated_step.start_solve),
@@ -255,7 +254,7 @@ class CompiledAccelerationState(CompiledState, AcceleratedState):
         """
         self._engine, self._memory, parts = engine, engine.take_memory(), engine.spring_form
         step, window = self._memory[:2]
-        if engine.has_edges:
+        if parts.has_edges:
             step = step._replace(spring_packets=parts.update_edges(step.spring_packets, problem))
         self._state = step, window
         self._external_force = external = as_kernel_array(problem.external_force)
