@@ -155,8 +155,8 @@ def guesses_current_positions(problem: StepProblem) -> bool:
     return guess is current or np.array_equal(guess, current)
 
 
-def pick_lowest_positions(step: StepObjective, p: Positions, *others: Positions) -> Positions:
-    """Return those of several positions that have the lowest objective.
+def pick_lowest_positions(step: StepObjective, p: Positions, *others: Positions) -> tuple[Positions, float]:
+    """Return those of several positions that have the lowest objective, and how much lower it is.
 
     The displacement from the first to the others must also be collision-free.
 
@@ -164,13 +164,16 @@ def pick_lowest_positions(step: StepObjective, p: Positions, *others: Positions)
         step: the objective.
         p: positions (n, 3) [m], returned as the same array if no others have a lower objective.
         others: positions (n, 3) [m].
+
+    Returns:
+        The positions (n, 3) [m], and the decrease of the objective from the first ones to them [J].
     """
-    lowest = p
+    lowest, decrease = p, 0.0
     for q in others:
-        is_lower = step.objective_change(lowest, q)[0] < 0.0
-        if is_lower and (not step.barrier_energies or step.max_step_size(p, q - p) == 1.0):
-            lowest = q
-    return lowest
+        change = step.objective_change(lowest, q)[0]
+        if change < 0.0 and (not step.barrier_energies or step.max_step_size(p, q - p) == 1.0):
+            lowest, decrease = q, decrease - change
+    return lowest, decrease
 
 
 def pick_lower_start(step: StepObjective, start: DescentPoint) -> DescentPoint:
@@ -180,7 +183,7 @@ def pick_lower_start(step: StepObjective, start: DescentPoint) -> DescentPoint:
         step: the objective.
         start: the point, returned itself if the prediction is not lower.
     """
-    p = pick_lowest_positions(step, start.positions, step.inertial_prediction())
+    p, _ = pick_lowest_positions(step, start.positions, step.inertial_prediction())
     return start if p is start.positions else DescentPoint(p, step.gradient(p))
 
 

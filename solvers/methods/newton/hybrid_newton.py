@@ -17,13 +17,13 @@ L-BFGS runs first. Its factor of Q is in float32, unless Q is so stiff that dire
 iteration takes 5 to 14 % less time (200 to 1100 vertices, one core with AVX-512), and directions need no more digits.
 Residuals then have relative errors of 1e-7, for free bodies of up to 1e-4. A solve whose initial guess is the current
 positions starts where the objective is lowest: there, at the inertial target (motion without forces) or at the inertial
-prediction (motion without springs). Near the minimum, segments of eight iterations alternate with rounds of four sweeps
+prediction (motion without springs). Near the minimum, segments of five iterations alternate with rounds of four sweeps
 of vertex block descent (`springbench.solvers.methods.quasi_newton.sweep_rounds`). More rounds of sweeps follow as long
-as each reduces the residual to 0.63 of it. Near means that an iteration of L-BFGS decreases the objective by at most
-5e-5 of the decrease so far, and by at most 5e-3 of it if no diagonal entry of Q exceeds 5000 times the inertia: sweeps
-far from a minimum lead to other, higher minima, the more often the stiffer the springs are. The sweeps come first if no
-entry exceeds 500 times the inertia; there are none if one exceeds the inertia over the square root of the machine
-epsilon.
+as each decreases the objective more per cost than the last segment did, or the residual to 0.32 of it. Near means that
+an iteration of L-BFGS decreases the objective by at most 5e-5 of the decrease since the initial guess, and by at most
+5e-3 of it if no diagonal entry of Q exceeds 5000 times the inertia: sweeps far from a minimum lead to other, higher
+minima, the more often the stiffer the springs are. The sweeps come first if no entry exceeds 500 times the inertia;
+there are none if one exceeds the inertia over the square root of the machine epsilon.
 
 One rule decides which of the three methods continues: that with the largest decrease of the objective per cost in its
 last steps. A method that was not yet measured is credited with the decrease that L-BFGS leaves, extrapolated from its
@@ -79,8 +79,8 @@ from springbench.solvers.kernels.descent_rounds import (
     GROUP_ITERATIONS,
     REASON_SWITCH,
     ROUND_STATE_DTYPE,
-    SEGMENT_ITERATIONS,
     init_rounds,
+    restart_rounds,
 )
 from springbench.solvers.kernels.iteration_loop import (
     NO_ITERATIONS,
@@ -153,9 +153,9 @@ by ten in about as many sweeps as a group has iterations."""
 
 _SOFT_RATIO, _SOFT_NEAR_FRACTION, _NEAR_FRACTION = 5e3, 5e-3, 5e-5
 """Largest ratio of the diagonal of Q to the inertia of soft springs, and the decrease of an iteration of L-BFGS, as a
-fraction of that since the start, at which sweeps may follow, for soft and for other springs. The larger fraction saves
-10 % of the time on the soft scenes of `configs/accuracy.yaml`; on others solves take 0.7 to 1.3 times as long, and
-often end in another minimum."""
+fraction of that since the initial guess, at which sweeps may follow, for soft and for other springs. The larger
+fraction saves 10 % of the time on the soft scenes of `configs/accuracy.yaml`; on others solves take 0.7 to 1.3 times as
+long, and often end in another minimum."""
 
 _ROUND_END_COST, _COLLISION_CHECK_COST = 0.1, 20.0
 """Costs of the end of a round and of a check for collisions, in iterations of L-BFGS: 0.01 to 0.4 for a call of the
@@ -260,6 +260,7 @@ class SolveControl:
         must_escape: whether the last point is a saddle point, to be left.
         is_minimum: whether the last point was reached by an unmodified Newton step that agrees with its model.
         residual: residual at the last point [J^(1/2)], None if it is not known.
+        start_decrease: decrease of the objective from the initial guess to where the solve starts [J].
         solver_phases: iterations, cost in Newton steps and time [s] of each method before the current phase; the
             iterations and cost of the current phase are included, its time is not.
         clock: clock of the phases [s].
@@ -272,6 +273,7 @@ class SolveControl:
     must_escape: bool = False
     is_minimum: bool = False
     residual: float | None = None
+    start_decrease: float = 0.0
     solver_phases: dict[str, tuple[int, float, float]] = field(default_factory=dict)
     clock: Callable[[], float] = field(default_factory=get_phase_clock)
     phase_name: str = ""
@@ -657,9 +659,16 @@ class HybridIteration:
         arrays = build_newton_arrays(self.metric, self._objective)
         return None if arrays is None else CompiledNewton.from_arrays(arrays)
 
-    def init_rounds(self) -> NDArray[Any]:
-        """Return the state of the rounds of a solve."""
-        return np.frombuffer(bytearray(self._initial_rounds), ROUND_STATE_DTYPE)  # `copy` copies field by field
+    def init_rounds(self, earlier_decrease: float = 0.0) -> NDArray[Any]:
+        """Return the state of the rounds of a solve.
+
+        Args:
+            earlier_decrease: decrease of the objective from the initial guess to the start [J].
+        """
+        rounds = np.frombuffer(bytearray(self._initial_rounds), ROUND_STATE_DTYPE)  # `copy` copies field by field
+        if earlier_decrease > 0.0:
+            rounds["earlier_decrease"] = earlier_decrease
+        return rounds
 
     def round_off(self, p: Positions) -> float:
         """Return the residual [J^(1/2)] that rounded positions p (n, 3) [m] leave."""
@@ -684,7 +693,8 @@ class HybridIteration:
             control: limits of the next iterations, read for each point; counts and costs are recorded there.
         """
         if guesses_current_positions(step.problem):
-            p = pick_lowest_positions(step, p, step.inertial_target(), step.inertial_prediction())
+            points = step.inertial_target(), step.inertial_prediction()
+            p, control.start_decrease = pick_lowest_positions(step, p, *points)
         yield from self.continue_from(step, DescentPoint(p, NO_GRADIENT), control)
 
     def continue_from(
@@ -702,7 +712,7 @@ class HybridIteration:
         while point is None or not point.is_stalled:
             if not (step.has_contact_elements or has_active_barrier(step, p)):
                 method_choice = method_choice or MethodChoice(
-                    self, step, p, self.start_lbfgs(step, p), control, self.init_rounds()
+                    self, step, p, self.start_lbfgs(step, p), control, self.init_rounds(control.start_decrease)
                 )
                 points, method_choice = method_choice.iterate_points(), None
                 for following in points:
@@ -821,6 +831,7 @@ class MethodChoice:
         self._run: AcceleratedState | None = run
         self._idle_run: AcceleratedState | None = None
         self._point, self._rounds = at or DescentPoint(start, NO_GRADIENT), rounds
+        self._start_decrease = float(rounds["earlier_decrease"][0])
         self._num_lbfgs_iterations, self._rival_gain = 0, 0.0  # last values read from and written to `rounds`
         self._measured_rule: MeasuredRule | None = None
         self._steepest = 0.0
@@ -848,11 +859,13 @@ class MethodChoice:
                 if name == "lbfgs":
                     point = self._run_lbfgs()
                 else:
-                    if self._run is not None:  # the gradient of L-BFGS has the round-off of its kernel
+                    if (run := self._run) is not None:  # its gradient has the round-off of its kernel
                         positions = self._point.positions
                         self._point = DescentPoint(positions, self._step.gradient(positions))
-                        self._idle_run, self._run = self._run, None
+                        self._idle_run, self._run = run, None
                     point = self._take_exact_steps() if name == "newton" else self._take_predicted_step()
+                    if point is self._point and run is not None and self._idle_run is run:  # it continues unchanged
+                        self._run, self._idle_run = run, None
             if point is not self._point:
                 self._point, self._control.is_minimum = point, self._agrees_with_model
                 yield point
@@ -897,10 +910,8 @@ class MethodChoice:
         rounds, step, limits = self._rounds, self._step, self._control.limits
         if self._run is None:
             self._run = self._method.start_lbfgs(step, self._point.positions)
-            rounds["group_start"], rounds["group_end"] = 0.0, rounds["num_iterations"] + GROUP_ITERATIONS
-            rounds["gain"], rounds["gain_ratio"], rounds["group_residual"] = np.inf, 1.0, 0.0
-            rounds["segment_end"], rounds["is_sweeping"] = rounds["num_iterations"] + SEGMENT_ITERATIONS, 0
-            rounds["late_start"], rounds["late_decrease"] = rounds["num_iterations"], 0.0
+            start = DescentPoint(self._start, NO_GRADIENT)
+            restart_rounds(rounds, self._start_decrease + compute_objective_decrease(step, start, self._point))
         if step.barrier_energies:  # each round is checked for collisions
             limits = limits._replace(max_iterations=1)
         rival_gain = max(self._gains["predicted tensions"], self._gains["newton"])

@@ -124,7 +124,8 @@ def start_lowest_solve(step, window, target, force, pin_targets, guess, external
         out: output (n, 3) [m], the positions at the start.
 
     Returns:
-        The residual [J^(1/2)] at the guess, NaN if it is not computed.
+        The residual [J^(1/2)] at the guess, NaN if it is not computed, and the decrease of the objective from there to
+        the start [J].
     """
     rows, size, at_guess = step.vertex_rows, len(window.direction), np.nan
     _evaluate_guess(step, window, target, force, pin_targets, guess)
@@ -132,7 +133,7 @@ def start_lowest_solve(step, window, target, force, pin_targets, guess, external
         _start_window(step, window)
         at_guess = compute_window_residual((step, window))
     _copy_trial(window)
-    is_lower = False
+    before, is_lower = step.objective_values[0], False
     if not _differs(guess.flat, current.flat, guess.size):
         for v in range(len(out)):
             for c in range(3):
@@ -146,7 +147,7 @@ def start_lowest_solve(step, window, target, force, pin_targets, guess, external
     read_positions(rows, window.trial_position, out)
     if is_lower or not measures_guess:
         _start_window(step, window)
-    return at_guess
+    return at_guess, before - step.objective_values[0]
 
 
 @jit_inner

@@ -1,6 +1,6 @@
 """Rounds of L-BFGS that alternate with sweeps of vertex block descent, without Python.
 
-    p <- S^4(L^8(p))     L an iteration of L-BFGS, S a sweep over all vertices
+    p <- S^4(L^5(p))     L an iteration of L-BFGS, S a sweep over all vertices
 
 This is a multiplicative composition of two nonlinear solvers (Brune, Knepley, Smith and Tu 2015, "Composing scalable
 nonlinear algebraic solvers"). L-BFGS, preconditioned by Q, reduces smooth errors in few iterations, but Q is much
@@ -195,7 +195,7 @@ def run_sweep_rounds(
     at_guess, count, residual, ended = np.nan, 0, np.nan, REASON_ITERATIONS
     if start != CONTINUES:
         sweeps.sweep_memory.sweep_scratch.omega[0] = NOT_STARTED
-        at_guess = start_lowest_solve(
+        at_guess, decrease = start_lowest_solve(
             step,
             window,
             arrays.target,
@@ -207,6 +207,7 @@ def run_sweep_rounds(
             start == STARTS_MEASURED,
             arrays.start,
         )
+        rounds[0].earlier_decrease = decrease
         rounds[0].residual_floor = EPS * compute_max_magnitude(arrays.start) * np.sqrt(unpinned_trace)
     if start == CONTINUES or limits.max_iterations > 0:
         count, residual, ended = _iterate_rounds((step, window, sweeps, arrays), rounds, limits)
