@@ -59,6 +59,9 @@ than an iteration."""
 _FAST_RESIDUAL_RATIO = 0.5
 """Largest ratio of residuals after the very first iterations at which the method is considered suitable."""
 
+_NEAR_ITERATIONS = 4
+"""Smallest number of iterations at the end of a segment over which their decrease is averaged."""
+
 _SWEEP_RESIDUAL_RATIO = 10.0**-0.5
 """Largest ratio of residuals at which more sweeps follow in any case: that of a tenth of the objective."""
 
@@ -83,8 +86,9 @@ ROUND_STATE_DTYPE = np.dtype(
         ("is_sweeping", np.int64),  # whether the next round consists of sweeps
         ("segment_end", np.int64),  # iterations after which sweeps may follow
         ("segment_residual", np.float64),  # residual at the last choice [J^(1/2)]; 0: not known
-        ("segment_decrease", np.float64),  # decrease of the objective at the last choice [J]
-        ("segment_rate", np.float64),  # decrease per iteration in the last segment [J]; infinite before the first
+        ("late_start", np.int64),  # iterations from which the decrease per iteration is averaged
+        ("late_decrease", np.float64),  # decrease of the objective there [J]
+        ("late_rate", np.float64),  # decrease per iteration at the end of the last segment [J]; infinite before that
         ("near_fraction", np.float64),  # largest decrease per iteration over that so far at which sweeps may follow
         ("earlier_decrease", np.float64),  # decrease from the initial guess to the start of these rounds [J]
         ("residual_floor", np.float64),  # residual that rounded positions leave [J^(1/2)]
@@ -108,16 +112,14 @@ def round_size(now):
 @register_jitable(**jit_inner_options)
 def _choose_sweeps(now, decrease, residual):
     """Decide whether the next round consists of sweeps."""
-    gain = decrease - now.segment_decrease
     if now.is_sweeping == 1:
-        is_better = gain > now.segment_rate * now.sweep_cost
+        is_better = decrease - now.late_decrease > now.late_rate * now.sweep_cost
         continues = is_better or residual < _SWEEP_RESIDUAL_RATIO * now.segment_residual
     else:
-        now.segment_rate = gain / SEGMENT_ITERATIONS
-        continues = now.segment_rate <= now.near_fraction * (now.earlier_decrease + decrease)
+        now.late_rate = (decrease - now.late_decrease) / (now.num_iterations - now.late_start)
+        continues = now.late_rate <= now.near_fraction * (now.earlier_decrease + decrease)
     now.is_sweeping = 1 if continues else 0
     now.segment_end, now.segment_residual = now.num_iterations + SEGMENT_ITERATIONS, residual
-    now.segment_decrease = decrease
 
 
 @register_jitable(**jit_inner_options)
@@ -198,6 +200,8 @@ def build_rounds(
                 ended = check_residual(found, limits)
             if ends_segment:
                 _choose_sweeps(now, total, found)
+            if ends_segment or now.num_iterations <= now.segment_end - _NEAR_ITERATIONS:
+                now.late_start, now.late_decrease = now.num_iterations, total
             if ended == REASON_ITERATIONS:
                 ended = _assess_round(now, total, found, limits.residual_limit) if is_done else REASON_STALLED
         return count, found, ended
@@ -247,7 +251,7 @@ def init_rounds(
     initial = np.zeros(1, ROUND_STATE_DTYPE)
     initial["group_end"], initial["segment_end"] = GROUP_ITERATIONS, SEGMENT_ITERATIONS
     initial["initial_residual"], initial["gain"], initial["gain_ratio"] = -1.0, np.inf, 1.0
-    initial["segment_rate"] = np.inf
+    initial["late_rate"] = np.inf
     initial["newton_cost"], initial["check_cost"] = newton_cost, check_cost
     initial["sweep_cost"], initial["near_fraction"], initial["is_sweeping"] = sweep_cost, near_fraction, starts_sweeping
     return initial
@@ -263,4 +267,5 @@ def restart_rounds(rounds: Any, earlier_decrease: float) -> None:
     count = rounds["num_iterations"]
     rounds["group_end"], rounds["segment_end"] = count + GROUP_ITERATIONS, count + SEGMENT_ITERATIONS
     rounds["group_start"], rounds["gain"], rounds["gain_ratio"], rounds["group_residual"] = 0.0, np.inf, 1.0, 0.0
-    rounds["is_sweeping"], rounds["segment_decrease"], rounds["earlier_decrease"] = 0, 0.0, earlier_decrease
+    rounds["is_sweeping"], rounds["earlier_decrease"] = 0, earlier_decrease
+    rounds["late_start"], rounds["late_decrease"] = count, 0.0
