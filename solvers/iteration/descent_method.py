@@ -156,7 +156,7 @@ def guesses_current_positions(problem: StepProblem) -> bool:
 
 
 def pick_lowest_positions(step: StepObjective, p: Positions, *others: Positions) -> tuple[Positions, float]:
-    """Return those of several positions that have the lowest objective, and how much lower it is.
+    """Return the positions with the lowest objective, and the decrease of it.
 
     The displacement from the first to the others must also be collision-free.
 

@@ -258,7 +258,7 @@ def init_rounds(
 
 
 def restart_rounds(rounds: Any, earlier_decrease: float) -> None:
-    """Begin a group and a segment of a method that starts anew, after another one.
+    """Begin a group and a segment of a method that starts again, after another one.
 
     Args:
         rounds: state of the rounds (1,), updated.

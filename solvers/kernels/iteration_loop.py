@@ -53,6 +53,18 @@ def iteration_limit(iterations: int) -> LoopLimits:
 
 
 @register_jitable(**jit_inner_options)
+def needs_residual(limits, count):
+    """Return whether the residual after a number of iterations is needed.
+
+    Args:
+        limits: limits of the loop.
+        count: number of iterations.
+    """
+    is_last = count == limits.max_iterations
+    return limits.residual_mode == RESIDUAL_EACH or (limits.residual_mode == RESIDUAL_LAST and is_last)
+
+
+@register_jitable(**jit_inner_options)
 def check_residual(residual, limits):
     """Return the termination reason of a residual.
 

@@ -280,8 +280,8 @@ def test_predicted_tensions_follow_the_second_hessian_without_a_factor(lbfgs_gai
         assert choice._gains["predicted tensions"] == (np.inf if attempt == num_attempts else 0.0)
 
 
-def test_lbfgs_keeps_its_history_after_an_attempt_that_did_not_move():
-    """After predicted tensions it starts anew, with the decrease since the initial guess."""
+def test_lbfgs_retains_its_history_after_an_attempt_without_a_step():
+    """After predicted tensions it starts again, with the decrease since the initial guess."""
     given = squeeze_cloth(1e3)
     prepared = HybridNewton().prepare(given.system)
     assert isinstance(prepared, PreparedHybrid)

@@ -28,12 +28,12 @@ there are none if one exceeds the inertia over the square root of the machine ep
 One rule decides which of the three methods continues: that with the largest decrease of the objective per cost in its
 last steps. A method that was not yet measured is credited with the decrease that L-BFGS leaves, extrapolated from its
 last two groups of iterations (`springbench.solvers.kernels.descent_rounds`). The exact Hessian is tried first. If it
-has no Cholesky factor at the second attempt, or at the first after L-BFGS has ended, predicted tensions follow. The
-exact method is tried again after a cost that doubles with each attempt that decreases the objective less than the
-others did meanwhile. The exact method continues as long as its Hessian is unmodified, the decrease agrees with the
-quadratic model, and the squared Newton decrement g'H^-1 g falls faster per cost than the decrease of L-BFGS fell from
-group to group. An indefinite Hessian gets the smallest multiple of inertia that has a factor
-(`springbench.solvers.methods.newton.inertia_shift`), or loses negative stiffness
+has no Cholesky factor at the second attempt, or at the first after L-BFGS has ended, predicted tensions follow. L-BFGS
+continues with its history after an attempt that finds no step. The exact method is tried again after a cost that
+doubles with each attempt that decreases the objective less than the others did meanwhile. The exact method continues as
+long as its Hessian is unmodified, the decrease agrees with the quadratic model, and the squared Newton decrement g'H^-1
+g falls faster per cost than the decrease of L-BFGS fell from group to group. An indefinite Hessian gets the smallest
+multiple of inertia that has a factor (`springbench.solvers.methods.newton.inertia_shift`), or loses negative stiffness
 (`springbench.solvers.methods.newton.hessian_regularisation`), whichever decreased the objective more per factorisation
 when last used. Costs are counted, not measured by a clock: in groups of L-BFGS iterations, from the numbers of springs,
 entries and operations of the factors and from the factorisations made. So equal solves make equal decisions and have
@@ -578,18 +578,18 @@ class MeasuredRule(ShiftScheduleRule):
         if self.agrees_with_model and slope > 0.0:
             self.decrement_ratio = inner_product(to.gradient, hessian.solve(to.gradient)) / slope
 
-    def record_compiled_steps(self, progress: NDArray[Any], decrease: float) -> None:
+    def record_compiled_steps(self, slope: float, agrees: bool, decrement_ratio: float, decrease: float) -> None:
         """Record the last of several steps with the exact Hessian.
 
         Args:
-            progress: progress of the solve (1,) after the steps.
-            decrease: decrease of the objective in the last one [J].
+            slope: derivative along its displacement [J], positive.
+            agrees: whether the decrease agreed with the model.
+            decrement_ratio: ratio of the squared Newton decrements.
+            decrease: decrease of the objective [J].
         """
-        last = progress[0]
         self._name = max(self._gains, key=lambda name: self._gains[name])
-        self._record_decrease(decrease, float(last["slope"]))
-        self.agrees_with_model = bool(last["agrees_with_model"])
-        self.decrement_ratio = float(last["decrement_ratio"])
+        self._record_decrease(decrease, slope)
+        self.agrees_with_model, self.decrement_ratio = agrees, decrement_ratio
 
     def _record_decrease(self, decrease: float, slope: float) -> None:
         """Record whether the quadratic model was accurate in a step."""
@@ -988,16 +988,15 @@ class MethodChoice:
         count, residual, _ = compiled.run_measured_steps.call(
             *fixed, control.limits, self._compute_max_decrement_ratio(), p, gradient, decreases, progress
         )
-        last = progress[0]
-        self._steepest = float(last["steepest_slope"])
-        failed = int(last["failed_supernode"])
-        self._method.factor.count_factorisations(int(last["num_factorisations"]), failed)
+        _, number, failed, self._steepest, _, _, slope, agrees, decrement_ratio = progress.item()
+        self._method.factor.count_factorisations(number, failed)
         if count == 0:
             rule.has_factor = failed < 0
             return self._point
-        rule.record_compiled_steps(progress, float(decreases[count - 1]))
+        falls: list[float] = decreases[:count].tolist()
+        rule.record_compiled_steps(slope, bool(agrees), decrement_ratio, falls[-1])
         point = DescentPoint(p, gradient)
-        self._record_steps("newton", count, decreases[:count].tolist(), [1.0] * count)
+        self._record_steps("newton", count, falls, [1.0] * count)
         control.num_iterations, control.residual = count, None if isnan(residual) else residual
         return point
 
@@ -1064,9 +1063,8 @@ class MethodChoice:
             before = self._patience if count == 1 else _FIRST_PATIENCE
             self._patience = _FIRST_PATIENCE if is_better else 2.0 * before
             self._is_trial_due, self._spent, self._fallen = False, 0.0, 0.0
-            rounds = self._rounds
             self._trial_cost = self._patience * (recent[-1][1] or self._method.newton_cost)
-            rounds["trial_iteration"] = rounds["num_iterations"] + GROUP_ITERATIONS * self._trial_cost
+            self._rounds["trial_iteration"] = self._num_lbfgs_iterations + GROUP_ITERATIONS * self._trial_cost
         else:
             self._spent, self._fallen = self._spent + self._method.newton_cost * spent, self._fallen + sum(decreases)
             self._is_trial_due |= self._spent >= self._trial_cost

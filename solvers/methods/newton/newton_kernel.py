@@ -21,9 +21,9 @@ from springbench.solvers.kernels.descent_search import (
 )
 from springbench.solvers.kernels.iteration_loop import (
     REASON_ITERATIONS,
-    RESIDUAL_EACH,
     build_compiled_loop,
     check_residual,
+    needs_residual,
 )
 from springbench.solvers.kernels.objective_kernels import (
     change_objective,
@@ -230,7 +230,7 @@ def run_measured_steps(arrays, step_data, exact_pins, limits, max_ratio, p, grad
         if not _take_measured_step(state, decreases[count:]):
             break
         count += 1
-        if limits.residual_mode == RESIDUAL_EACH:
+        if needs_residual(limits, count):
             residual = compute_residual_norm(arrays.search.residual_norm, gradient)
             ended = check_residual(residual, limits)
     return count, residual, ended

@@ -248,7 +248,7 @@ class PredictedTensionNewton:
         moved, count, residual = compiled.run_predicted_steps.call(
             *fixed, relaxation, limits, budget, point.positions, at is not point, *outputs
         )
-        shift.value, _, shift.ratio, can_reduce, self._slope, is_trial_due = progress[0].item()
+        shift.value, _, shift.ratio, can_reduce, self._slope, is_trial_due = progress.item()
         shift.can_reduce, self._first_point = bool(can_reduce), None
         return PredictedSteps(
             DescentPoint(p, gradient) if moved else point,

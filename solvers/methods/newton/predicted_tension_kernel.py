@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from springbench.solvers.jit.kernel_compilation import jit_inner, jit_kernel
 from springbench.solvers.kernels.accelerated_descent import AccelerationWindow
 from springbench.solvers.kernels.descent_search import exceeds_roundoff, move_to_trial
-from springbench.solvers.kernels.iteration_loop import REASON_ITERATIONS, RESIDUAL_EACH, check_residual
+from springbench.solvers.kernels.iteration_loop import REASON_ITERATIONS, check_residual, needs_residual
 from springbench.solvers.kernels.line_search_conditions import MAX_HALVINGS, is_armijo_step
 from springbench.solvers.kernels.objective_kernels import (
     change_objective,
@@ -159,7 +159,7 @@ def run_predicted_steps(
         decreases[count], costs[count] = _take_step(state, compared, is_compared and count == 0)
         if decreases[count] == 0.0:
             return count, count + 1, residual
-        if limits.residual_mode == RESIDUAL_EACH:
+        if needs_residual(limits, count + 1):
             residual = compute_residual_norm(arrays.search.residual_norm, gradient)
             ended = check_residual(residual, limits)
         cost = budget.newton_cost * costs[count]
