@@ -5,15 +5,17 @@
     python -m tests.bench.fastest [CONFIG] [--solver hybrid] [--only WORDS] [--rounds 15] [--measure error | own-gap]
 
 The steps, the initial guesses and the methods are those of an accuracy config. An accuracy is an upper bound of one of
-two measures, where g is the objective:
+these measures, where g is the objective:
 
     gap      (g - g*)/(g0 - g*), relative to the lowest known minimum
     error    largest distance of a vertex from its position in that minimum, over the same distance at the step's start
     own-gap  gap relative to the certified minimum to which the method itself converges
 
-Where a step has several minima, which one a method reaches is chance; `own-gap` then measures how fast it converges to
-its own, and `excess` how much higher that is than the lowest known, as a gap. A method that converges to a point that
-is no certified minimum reaches no accuracy.
+Minima are known from the search of references and, in `results`, from earlier runs of `springbench accuracy` with the
+config, which certify the ends of all its methods. The published ratios, except of `configs/stiff.yaml`, follow such a
+run. Where a step has several minima, which one a method reaches is chance; `own-gap` then measures how fast it
+converges to its own, and `excess` how much higher that is than the lowest known, as a gap. A method that converges to a
+point that is no certified minimum reaches no accuracy.
 
 A method reaches an accuracy with its first iterate that satisfies it. A first pass evaluates all iterates. The methods
 that may be the fastest are then timed interleaved in one process, for several rounds, by the processor time of the
