@@ -864,7 +864,7 @@ class MethodChoice:
                         self._point = DescentPoint(positions, self._step.gradient(positions))
                         self._idle_run, self._run = run, None
                     point = self._take_exact_steps() if name == "newton" else self._take_predicted_step()
-                    if point is self._point and run is not None and self._idle_run is run:  # it continues unchanged
+                    if point is self._point and run is not None and self._idle_run is run:  # L-BFGS continues
                         self._run, self._idle_run = run, None
             if point is not self._point:
                 self._point, self._control.is_minimum = point, self._agrees_with_model
