@@ -156,7 +156,7 @@ def guesses_current_positions(problem: StepProblem) -> bool:
 
 
 def pick_lowest_positions(step: StepObjective, p: Positions, *others: Positions) -> tuple[Positions, float]:
-    """Return the positions with the lowest objective, and the decrease of it.
+    """Return the positions with the lowest objective, and its decrease.
 
     The displacement from the first to the others must also be collision-free.
 

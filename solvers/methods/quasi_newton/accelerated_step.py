@@ -133,35 +133,34 @@ def start_lowest_solve(step, window, target, force, pin_targets, guess, external
         _start_window(step, window)
         at_guess = compute_window_residual((step, window))
     _copy_trial(window)
-    before, is_lower = step.objective_values[0], False
+    before = step.objective_values[0]
     if not _differs(guess.flat, current.flat, guess.size):
         for v in range(len(out)):
             for c in range(3):
                 out[v, c] = target[v, c]
         place_pinned(rows.pinned_vertices, pin_targets, out)
-        is_lower = _move_if_lower(step, window, pin_targets, out)
+        _move_if_lower(step, window, pin_targets, out)
         predict_positions(rows.inertia_diagonal, target, external_force, rows.pinned_vertices, pin_targets, out)
-        is_lower |= _move_if_lower(step, window, pin_targets, out)
+        _move_if_lower(step, window, pin_targets, out)
     for k in range(size):
         window.trial_position[k], window.trial_descent[k] = window.position[k], window.descent[k]
     read_positions(rows, window.trial_position, out)
-    if is_lower or not measures_guess:
+    decrease = before - step.objective_values[0]
+    if decrease > 0.0 or not measures_guess:
         _start_window(step, window)
-    return at_guess, before - step.objective_values[0]
+    return at_guess, decrease
 
 
 @jit_inner
 def _move_if_lower(step, window, pin_targets, p):
-    """Move to positions p (n, 3) [m] if they lower the objective; return whether they do."""
+    """Move to positions p (n, 3) [m] if they lower the objective."""
     write_positions(step.vertex_rows, p, pin_targets, window.trial_position)
     if not _differs(window.trial_position, window.position, len(window.direction)):
-        return False
+        return
     there = evaluate_trial(step, window)
-    if not there < step.objective_values[0]:
-        return False
-    step.objective_values[0] = there
-    _copy_trial(window)
-    return True
+    if there < step.objective_values[0]:
+        step.objective_values[0] = there
+        _copy_trial(window)
 
 
 @jit_inner
