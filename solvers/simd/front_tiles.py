@@ -23,8 +23,14 @@ from springbench.solvers.simd.llvm_vectors import (
 )
 
 TILE_ROWS, TILE_COLUMNS = 8, 6
-"""Rows and columns (two vertices) of a tile. The sums of one tile and a factor fit the registers of AVX2, those of two
-tiles the registers of AVX-512."""
+"""Rows and columns (two vertices) of a tile. The sums of one tile and a factor fit the registers of AVX2."""
+
+_TILE_HEIGHTS = (4, 2, 1)
+"""Numbers of tiles, one below the other, whose sums a product with AVX-512 has in registers: the more, the fewer
+factors are loaded for each sum."""
+
+_PREFETCH_COLUMNS = 8
+"""Prefetch distance of a product: hardware does not predict columns that are a page or more apart."""
 
 _PACKET_TYPE = ir.VectorType(F64, TILE_ROWS)
 
@@ -56,18 +62,23 @@ class _StripBuilder(VectorBuilder):
 
 def _subtract_tile_product_code(
     typingctx: Any, L: Any, at: Any, top: Any, stride: Any, depth: Any,
-    C: Any, to: Any, step: Any, strips: Any, columns: Any,
+    C: Any, to: Any, step: Any, strips: Any, overwrite: Any, columns: Any,
 ) -> Any:  # fmt: skip
     """Compute C[to + r + step j] -= sum over k < depth of L[at + r + stride k] L[top + j + stride k].
 
-    j < columns, and r covers `strips` strips of eight rows.
+    j < columns, and r covers `strips` strips of eight rows. C is not read, as if it were zero, if `overwrite` is not
+    zero.
     """
-    declared = literal_signature(L, at, top, stride, depth, C, to, step, strips, columns)
+    declared = literal_signature(L, at, top, stride, depth, C, to, step, strips, overwrite, columns)
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        L, at, top, stride, depth, C, to, step, strips, columns = unpack_arguments(context, builder, signature, args)
+        L, at, top, stride, depth, C, to, step, strips, overwrite, columns = unpack_arguments(
+            context, builder, signature, args
+        )
         v = _StripBuilder(context, builder)
         left, above = builder.gep(L, [at]), builder.gep(L, [top])
+        from_zero = builder.icmp_signed("!=", overwrite, I64(0))
+        ahead = builder.mul(stride, I64(_PREFETCH_COLUMNS))
 
         def tile(row: Any, vectors: int) -> None:
             """Process a number of vectors of rows, from `row` on."""
@@ -77,11 +88,19 @@ def _subtract_tile_product_code(
                 for j in range(columns) for begin in begins
             ]  # fmt: skip
             sums = [cgutils.alloca_once(builder, _PACKET_TYPE) for _ in targets]
-            for accumulator, target in zip(sums, targets, strict=True):
-                builder.store(v.load_rows(target), accumulator)
+            with builder.if_else(from_zero) as (then, otherwise):
+                with then:
+                    for accumulator in sums:
+                        builder.store(ir.Constant(_PACKET_TYPE, [0.0] * TILE_ROWS), accumulator)
+                with otherwise:
+                    for accumulator, target in zip(sums, targets, strict=True):
+                        builder.store(v.load_rows(target), accumulator)
             with cgutils.for_range(builder, depth) as loop:
                 column = builder.mul(loop.index, stride)
-                rows = [v.load_rows(builder.gep(left, [builder.add(column, begin)])) for begin in begins]
+                places = [builder.gep(left, [builder.add(column, begin)]) for begin in begins]
+                for place in places:
+                    prefetch_line(builder, builder.gep(place, [ahead]))
+                rows = [v.load_rows(place) for place in places]
                 across = builder.gep(above, [column])
                 for j in range(columns):
                     factor = v.broadcast_from_memory(builder.gep(across, [I64(j)]))
@@ -91,12 +110,13 @@ def _subtract_tile_product_code(
             for accumulator, target in zip(sums, targets, strict=True):
                 v.store(builder.load(accumulator), target)
 
-        together = 2 if v.has_avx512 else 1
-        whole = builder.udiv(strips, I64(together))
-        with cgutils.for_range(builder, whole) as loop:
-            tile(builder.mul(loop.index, I64(TILE_ROWS * together)), together)
-        with cgutils.for_range_slice(builder, builder.mul(whole, I64(together)), strips, I64(1), I64) as (strip, _):
-            tile(builder.mul(strip, I64(TILE_ROWS)), 1)
+        begin = I64(0)
+        for vectors in _TILE_HEIGHTS if v.has_avx512 else (1,):
+            count = builder.udiv(builder.sub(strips, begin), I64(vectors))
+            end = builder.add(begin, builder.mul(count, I64(vectors)))
+            with cgutils.for_range_slice(builder, begin, end, I64(vectors), I64) as (strip, _):
+                tile(builder.mul(strip, I64(TILE_ROWS)), vectors)
+            begin = end
         return context.get_dummy_value()
 
     return declared, generate

@@ -5,9 +5,10 @@
 
 An iteration consists of the gradient, the Hessian, its factorisation, the solve, and the change of the objective, on a
 sheet that is stretched by 5 %, so that the Hessian is positive definite. PARDISO, an optional dependency (`pardiso`),
-computes the numeric factorisation of that Hessian alone. Measurements with one and two threads alternate. A pause
-separates the two programs, so that waiting threads of one do not spin during the measurement of the other. The table
-has median wall times, and medians of the rounds' ratios with their quartiles. It requires two idle cores.
+computes the numeric factorisation of that Hessian alone. Measurements of both programs with one and two threads
+alternate. A pause separates the programs, so that waiting threads of one do not spin during the measurement of the
+other. The table has median wall times, and medians of the rounds' ratios with their quartiles. It requires two idle
+cores.
 """
 
 from __future__ import annotations
@@ -85,15 +86,24 @@ def _measure_seconds(work: Callable[[], object], repeats: int) -> float:
     return (perf_counter() - begin) / repeats
 
 
-def _measure_interleaved(works: list[Callable[[], object]], rounds: int) -> np.ndarray:
-    """Measure wall times (rounds, works) [s]; the order of the works alternates by round."""
-    seconds = np.empty((rounds, len(works)))
-    for work in works:
+def _measure_interleaved(programs: list[list[Callable[[], object]]], rounds: int) -> np.ndarray:
+    """Measure wall times (rounds, works) [s] of the works of several programs.
+
+    The order of the works alternates by round. An untimed call precedes each, and a pause follows each program.
+    """
+    seconds = np.empty((rounds, sum(map(len, programs))))
+    for work in (work for works in programs for work in works):
         work()
-    repeats = max(1, int(0.02 / _measure_seconds(works[0], 1)))
+    repeats = [max(1, int(0.02 / _measure_seconds(works[0], 1))) for works in programs]
     for k in range(rounds):
-        for i in range(len(works))[:: 1 if k % 2 == 0 else -1]:
-            seconds[k, i] = _measure_seconds(works[i], repeats)
+        first = 0
+        for works, count in zip(programs, repeats, strict=True):
+            for i in range(len(works))[:: 1 if k % 2 == 0 else -1]:
+                works[i]()
+                seconds[k, first + i] = _measure_seconds(works[i], count)
+            first += len(works)
+            if len(programs) > 1:
+                sleep(PAUSE)
     return seconds
 
 
@@ -113,18 +123,15 @@ def measure_size(size: int, rounds: int) -> dict[str, float]:
     def limit_iteration(threads: int) -> Callable[[], object]:
         return lambda: (numba.set_num_threads(threads), iterate())
 
-    seconds = _measure_interleaved([limit_iteration(1), limit_iteration(2)], rounds)
-    one, two = np.median(seconds, axis=0).tolist()
+    factorisations = [work for k in (1, 2) if (work := build_pardiso_factorisation(step, p, k))]
+    programs = [[limit_iteration(1), limit_iteration(2)], *([factorisations] if factorisations else [])]
+    seconds = _measure_interleaved(programs, rounds)
+    one, two, *pardiso = np.median(seconds, axis=0).tolist()
     row = {"size": size, "one_thread_ms": 1e3 * one, "two_threads_ms": 1e3 * two}
     row |= _compute_quartiles("thread_ratio", seconds[:, 0] / seconds[:, 1])
-    sleep(PAUSE)
-    factorisations = [work for k in (1, 2) if (work := build_pardiso_factorisation(step, p, k))]
-    if factorisations:
-        pardiso_seconds = _measure_interleaved(factorisations, rounds)
-        sleep(PAUSE)
-        pardiso_one, pardiso_two = np.median(pardiso_seconds, axis=0).tolist()
-        row |= {"pardiso_one_thread_ms": 1e3 * pardiso_one, "pardiso_two_threads_ms": 1e3 * pardiso_two}
-        row |= _compute_quartiles("pardiso_ratio", pardiso_seconds[:, 1] / two)
+    if pardiso:
+        row |= {"pardiso_one_thread_ms": 1e3 * pardiso[0], "pardiso_two_threads_ms": 1e3 * pardiso[1]}
+        row |= _compute_quartiles("pardiso_ratio", seconds[:, 3] / seconds[:, 1])
     return row
 
 

@@ -165,9 +165,11 @@ def set_transposed_product(square, start, own, panel, offset, index, at, below, 
         y[4 * (x_row + j) + 2] += s2
 
 
-def subtract_tile_product(L, at, top, stride, depth, C, to, step, strips, columns):
-    """Subtract the product of all columns to the left from a tile."""
+def subtract_tile_product(L, at, top, stride, depth, C, to, step, strips, overwrite, columns):
+    """Subtract the product of all columns to the left from a tile, or from zero."""
     for j in range(columns):
+        if overwrite != 0:
+            C[to + step * j : to + step * j + TILE_ROWS * strips] = 0.0
         for k in range(depth):
             factor = L[top + j + stride * k]
             for r in range(TILE_ROWS * strips):

@@ -124,7 +124,7 @@ class BlockCholesky:
                 f"{memory.format_bytes(needs)} of memory, "
                 f"where {memory.format_bytes(free)} is available; use solver numba or newton-cg, or a coarser mesh"
             )
-        self.panels = np.zeros(f.panel_start[-1] + TILE_ROWS)
+        self.panels = memory.allocate_aligned(int(f.panel_start[-1]) + TILE_ROWS)
         self._no_values, self._no_vectors = np.empty((0, d, d)), np.empty((0, d))
         self._workspaces = {1: self._allocate(schedule, updates, 1)}
 
@@ -144,9 +144,10 @@ class BlockCholesky:
         members = np.diff(f.member_start)
         rows = round_up_rows(round_up_columns(f.block_size * f.num_columns))
         rows += round_up_rows(f.block_size * (members - f.num_columns))
+        front_size = int(rows.max(initial=0)) + TILE_ROWS
         scratch = FactorisationScratch(
-            np.zeros((threads, int(rows.max(initial=0)) + TILE_ROWS)),
-            np.zeros(updates),
+            memory.allocate_aligned(threads * front_size).reshape(threads, -1),
+            memory.allocate_aligned(updates),
             np.zeros(groups + 1, np.int64),
             np.zeros(groups + 1, np.int64),
             np.zeros((threads, TILE_COLUMNS)),

@@ -76,6 +76,21 @@ round_up_columns_inner = jit_inner(round_up_columns)
 
 
 @jit_inner
+def clear_lower_triangle(matrix, start, stride, first, end):
+    """Set columns of a matrix to zero, from the first row of the tiles with their diagonal entries on.
+
+    Args:
+        matrix: memory of the matrix.
+        start: its first entry.
+        stride: entries from one column to the next.
+        first, end: range of the columns.
+    """
+    for j in range(first, end):
+        column = start + j * stride
+        matrix[column + j // TILE_COLUMNS * TILE_COLUMNS // TILE_ROWS * TILE_ROWS : column + stride] = 0.0
+
+
+@jit_inner
 def eliminate_front(fronts, supernode, values, to, min_pivots, triangles):
     """Factorise the panel of a supernode.
 
@@ -121,7 +136,18 @@ def factorise_diagonal_block(fronts, supernode, values, to, first, min_pivots, t
         above = tile // TILE_ROWS * TILE_ROWS
         column, strips = to.panel_offset + tile * to.stride, (_diagonal_end(to, end) - above) // TILE_ROWS
         _subtract_tile(
-            to.panels, left, above, tile, to.stride, tile - first, to.panels, column + above, to.stride, strips, columns
+            to.panels,
+            left,
+            above,
+            tile,
+            to.stride,
+            tile - first,
+            to.panels,
+            column + above,
+            to.stride,
+            strips,
+            ZERO,
+            columns,
         )
         for j in range(columns):
             min_pivots[j] = 0.0  # columns that complete a tile are those of the identity
@@ -173,7 +199,18 @@ def eliminate_rows_below(to, first, triangles, part, parts):
         for tile in range(first, end, TILE_COLUMNS):
             columns, column = min(TILE_COLUMNS, end - tile), to.panel_offset + tile * to.stride
             _subtract_tile(
-                to.panels, left, row, tile, to.stride, tile - first, to.panels, column + row, to.stride, strips, columns
+                to.panels,
+                left,
+                row,
+                tile,
+                to.stride,
+                tile - first,
+                to.panels,
+                column + row,
+                to.stride,
+                strips,
+                ZERO,
+                columns,
             )
             _solve_tile(to, column + row, triangles[(tile - first) // TILE_COLUMNS], strips, columns)
 
@@ -201,17 +238,19 @@ def subtract_panel_product(to, first, part, parts):
         to.width,
         part,
         parts,
+        ZERO,
     )
 
 
 @jit_inner
-def subtract_front_update(to, columns, part, parts):
+def subtract_front_update(to, columns, part, parts, overwrite):
     """Subtract the product of a panel's rows below from the update.
 
     Args:
         to: front of a supernode, whose update is changed.
         columns: number of columns of the update without its right-hand side, in whole tiles.
         part, parts: which part of the rows is processed, and number of parts.
+        overwrite: 1 if the update is not yet defined and counts as zero, else 0.
     """
     for first in range(0, to.width, PANEL_DEPTH):
         left, depth = to.panel_offset + first * to.stride, _block_end(to, first) - first
@@ -228,6 +267,7 @@ def subtract_front_update(to, columns, part, parts):
             columns,
             part,
             parts,
+            overwrite if first == 0 else ZERO,
         )
 
 
@@ -261,10 +301,11 @@ def _solve_tile(to, at, triangle, strips, columns):
 
 
 @jit_inner
-def _subtract_lower_product(panels, left, stride, depth, head, target, to, size, first, end, part, parts):
+def _subtract_lower_product(panels, left, stride, depth, head, target, to, size, first, end, part, parts, overwrite):
     """Subtract the lower triangle of L L' from columns of a matrix.
 
-    L: columns of the panel; head: offset of the rows that are multiplied; first, end: range of the matrix columns.
+    L: columns of the panel; head: offset of the rows that are multiplied; first, end: range of the matrix columns;
+    overwrite: whether the matrix counts as zero.
     """
     begin = first // TILE_ROWS * TILE_ROWS
     height = _part_height(size - begin, parts)
@@ -284,14 +325,15 @@ def _subtract_lower_product(panels, left, stride, depth, head, target, to, size,
                 place,
                 size,
                 strips,
+                overwrite,
                 min(TILE_COLUMNS, end - tile),
             )
 
 
 @jit_inner
-def _subtract_tile(panels, left, row, top, stride, depth, target, to, size, strips, columns):
+def _subtract_tile(panels, left, row, top, stride, depth, target, to, size, strips, overwrite, columns):
     """Call `subtract_tile_product` for six or three columns."""
     if columns == 6:
-        subtract_tile_product(panels, left + row, left + top, stride, depth, target, to, size, strips, 6)
+        subtract_tile_product(panels, left + row, left + top, stride, depth, target, to, size, strips, overwrite, 6)
     else:
-        subtract_tile_product(panels, left + row, left + top, stride, depth, target, to, size, strips, 3)
+        subtract_tile_product(panels, left + row, left + top, stride, depth, target, to, size, strips, overwrite, 3)

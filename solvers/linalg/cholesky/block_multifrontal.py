@@ -26,6 +26,7 @@ from springbench.solvers.linalg.cholesky.block_front import (
     ONE,
     ZERO,
     DenseFront,
+    clear_lower_triangle,
     eliminate_front,
     eliminate_rows_below,
     factorise_diagonal_block,
@@ -166,7 +167,7 @@ def _factorise_group(fronts, schedule, group, values, panels, x, scratch, thread
             return
         if len(x) > 0:
             _forward_substitution(fronts, schedule, s, panels, x, scratch, thread)
-        subtract_front_update(to, _update_width(fronts, s), ZERO, ONE)
+        subtract_front_update(to, _update_width(fronts, s), ZERO, ONE, _is_leaf(fronts, s))
 
 
 @jit_inner
@@ -185,7 +186,7 @@ def _process_part(fronts, schedule, stage, values, panels, x, scratch, thread, p
     else:
         if part == 0 and len(x) > 0:
             _forward_substitution(fronts, schedule, s, panels, x, scratch, thread)
-        subtract_front_update(to, _update_width(fronts, s), part, parts)
+        subtract_front_update(to, _update_width(fronts, s), part, parts, _is_leaf(fronts, s))
 
 
 @jit_inner
@@ -240,6 +241,12 @@ def _front_of(fronts, schedule, supernode, panels, scratch, thread):
 
 
 @jit_inner
+def _is_leaf(fronts, supernode):
+    """Return 1 if a supernode has no children, so that its update consists of one product, else 0."""
+    return ONE if fronts.first_child[supernode] < 0 else ZERO
+
+
+@jit_inner
 def _locate_update(schedule, supernode, thread):
     """Return the first entry of an update."""
     base = 0 if schedule.is_shared[supernode] else thread * schedule.thread_stack_size[0]
@@ -250,12 +257,13 @@ def _locate_update(schedule, supernode, thread):
 def _assemble_columns(fronts, schedule, supernode, values, to, scratch, thread, begin, end):
     """Assemble the columns of a front between two members: matrix blocks, and the children's updates."""
     size = fronts.block_size
-    first = to.panel_offset + (size * begin if begin < to.num_columns else to.width) * to.stride
-    last = to.panel_offset + (size * end if end < to.num_columns else to.width) * to.stride
-    to.panels[first:last] = 0.0
-    above, below = size * max(0, begin - to.num_columns), size * max(0, end - to.num_columns)
-    start = to.update_offset
-    to.update_buffer[start + above * to.update_stride : start + below * to.update_stride] = 0.0
+    left = size * begin if begin < to.num_columns else to.width
+    right = size * end if end < to.num_columns else to.width
+    clear_lower_triangle(to.panels, to.panel_offset, to.stride, left, right)
+    first, last = to.panel_offset + left * to.stride, to.panel_offset + right * to.stride
+    if not _is_leaf(fronts, supernode):
+        above, below = size * max(0, begin - to.num_columns), size * max(0, end - to.num_columns)
+        clear_lower_triangle(to.update_buffer, to.update_offset, to.update_stride, above, below)
     for k in range(fronts.block_start[supernode], fronts.block_start[supernode + 1]):
         e, at = fronts.block_index[k], fronts.entry_offset[k]
         if first <= at < last:
