@@ -27,6 +27,7 @@ from springbench.solvers.iteration.iterative_solver import (
 from springbench.solvers.jit.typed_kernel import TypedKernel, as_kernel_array
 from springbench.solvers.kernels import objective_kernels
 from springbench.solvers.kernels.descent_search import SearchArrays, bound_decrement_roundoff
+from springbench.solvers.kernels.free_components import FreeComponents
 from springbench.solvers.kernels.iteration_loop import LoopLimits
 from springbench.solvers.kernels.line_search_conditions import (
     ARMIJO_FRACTION,
@@ -275,6 +276,11 @@ class ResidualMetric:
     @cached_property
     def _component_labels(self) -> NDArray[np.int32]:
         return connected_components(self._Q, directed=False)[1]
+
+    @cached_property
+    def free_components(self) -> FreeComponents:
+        """The connected components of Q whose translation only inertia resists."""
+        return FreeComponents.from_matrix(self.system, self._Q, self._component_labels)
 
     def solve(self, b: Positions) -> Positions:
         """Return Q^-1 b, (n, 3), zero at exactly pinned vertices."""

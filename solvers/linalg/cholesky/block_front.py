@@ -77,7 +77,7 @@ round_up_columns_inner = jit_inner(round_up_columns)
 
 @jit_inner
 def clear_lower_triangle(matrix, start, stride, first, end):
-    """Set columns of a matrix to zero, from the first row of the tiles with their diagonal entries on.
+    """Set the lower triangle of columns to zero, in whole tiles.
 
     Args:
         matrix: memory of the matrix.

@@ -15,7 +15,9 @@ Sorensen 1983).
 
 L-BFGS runs first. Its factor of Q is in float32, unless Q is so stiff that directions would have no correct digit: an
 iteration takes 5 to 14 % less time (200 to 1100 vertices, one core with AVX-512), and directions need no more digits.
-Residuals then have relative errors of 1e-7, for free bodies of up to 1e-4. A solve whose initial guess is the current
+Residuals then have relative errors of 1e-7. It is in float64 if a connected component has no pins: directions conserve
+its momentum, and after sweeps, which do not, it is translated to where inertia and external forces are in equilibrium
+(`springbench.solvers.kernels.free_components`). A solve whose initial guess is the current
 positions starts where the objective is lowest: there, at the inertial target (motion without forces) or at the inertial
 prediction (motion without springs). Near the minimum, segments of five iterations alternate with rounds of four sweeps
 of vertex block descent (`springbench.solvers.methods.quasi_newton.sweep_rounds`). More rounds of sweeps follow as long
@@ -191,7 +193,7 @@ class HybridNewton:
         with cache_symbolic_analysis():
             metric, objective = ResidualMetric(system), FixedObjective(system)
             precision = "float64" if _needs_double_precision(metric) else "float32"
-            lbfgs = Lbfgs(precision=precision).prepare_with_sweeps(system)
+            lbfgs = Lbfgs(precision=precision).prepare_with_sweeps(system, metric.free_components)
             method, factor = HybridIteration(objective, metric, lbfgs), objective.hessian_matrix.factor
         facts = metric.stats | {"nnz_hessian_factor": float(factor.nonzeros)}
         choice = f"a factor of the Hessian with {factor.nonzeros:,} entries; for L-BFGS, {lbfgs.description}"
@@ -206,12 +208,12 @@ class HybridNewton:
 
 
 def _needs_double_precision(metric: ResidualMetric) -> bool:
-    """Return whether float32 leaves directions Q^-1 g without a digit.
+    """Return whether directions Q^-1 g need float64.
 
-    No eigenvalue of Q relative to the inertia exceeds twice the largest ratio of their diagonals, as Q is diagonally
-    dominant.
+    They do if float32 leaves no correct digit, or for components whose momentum is conserved. No eigenvalue of Q
+    relative to the inertia exceeds twice the largest ratio of their diagonals, as Q is diagonally dominant.
     """
-    return _exceeds_ratio(metric, 0.5 * _FLOAT32_CONDITION)
+    return len(metric.free_components.vertices) > 0 or _exceeds_ratio(metric, 0.5 * _FLOAT32_CONDITION)
 
 
 def _exceeds_ratio(metric: ResidualMetric, limit: float) -> bool:

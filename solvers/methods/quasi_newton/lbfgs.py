@@ -18,6 +18,7 @@ processor.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import ClassVar, Literal
 
 from springbench.solvers.contact.half_space.vertex_contact import without_vertex_contact
@@ -25,6 +26,7 @@ from springbench.solvers.iteration.descent_method import ResidualMetric
 from springbench.solvers.iteration.iterative_solver import IterativeSolver, SolverState
 from springbench.solvers.iteration.solver_info import Citation, SolverInfo
 from springbench.solvers.kernels.acceleration_coefficients import LBFGS_RULE
+from springbench.solvers.kernels.free_components import FreeComponents
 from springbench.solvers.methods.local_global.accelerated_local_global import AccelerationScheme, InterpretedState
 from springbench.solvers.methods.local_global.aggregated_jacobi import AggregatedSweeps, require_valid_sweeps
 from springbench.solvers.methods.local_global.prefactored import PreparedLocalGlobal, prepare_local_global
@@ -114,8 +116,12 @@ class Lbfgs(WindowedAcceleration):
         base = prepare_local_global(system, energies, lambda Q: (AggregatedSweeps(Q, self.jacobi_sweeps), words))
         return _PreparedLbfgsJacobi(base, metric, scheme, FixedObjective(system))
 
-    def prepare_with_sweeps(self, system: System) -> PreparedAccelerated:
+    def prepare_with_sweeps(self, system: System, free_components: FreeComponents) -> PreparedAccelerated:
         """Prepare rounds that alternate with sweeps, with the factor of Q and without barrier energies.
+
+        Args:
+            system: the system.
+            free_components: its components whose translation only inertia resists.
 
         Raises:
             NotPositiveDefinite: if the system leaves some positions undetermined.
@@ -124,7 +130,11 @@ class Lbfgs(WindowedAcceleration):
         from springbench.solvers.methods.quasi_newton import lbfgs_with_sweeps  # imported only for the hybrid
 
         return prepare_without_barriers(
-            system, self._acceleration_scheme, self.linear_solver, self.precision, lbfgs_with_sweeps.LbfgsSweepEngine
+            system,
+            self._acceleration_scheme,
+            self.linear_solver,
+            self.precision,
+            partial(lbfgs_with_sweeps.LbfgsSweepEngine, free_components=free_components),
         )
 
     @property

@@ -10,6 +10,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 from springbench.solvers.jit.typed_kernel import TypedKernel, as_kernel_array
+from springbench.solvers.kernels.free_components import FreeComponents
 from springbench.solvers.kernels.iteration_loop import NO_ITERATIONS, LoopLimits
 from springbench.solvers.methods.local_global.accelerated_local_global import AccelerationScheme
 from springbench.solvers.methods.local_global.fused_local_global import PreparedCompiledLocalGlobal
@@ -34,14 +35,18 @@ from springbench.solvers.model.step_problem import Positions, StepProblem
 class LbfgsSweepEngine(CompiledEngine):
     """Compiled iteration whose rounds alternate with sweeps."""
 
-    def __init__(self, scheme: AccelerationScheme, compiled: PreparedCompiledLocalGlobal) -> None:
+    def __init__(
+        self, scheme: AccelerationScheme, compiled: PreparedCompiledLocalGlobal, free_components: FreeComponents
+    ) -> None:
         """Prepare the iteration and the sweeps of a system.
 
         Args:
             scheme: coefficients of the acceleration.
             compiled: local-global method of the system, whose energies are compiled.
+            free_components: components of the system whose translation only inertia resists.
         """
         super().__init__(scheme, compiled)
+        self._free_components = free_components
         system = compiled.base.system
         parts = vbd.decompose_system(system, "hybrid")
         self.sweeps = vbd.PreparedVertexBlockDescent.from_blocks(system, *parts, 0.0, compiled)
@@ -58,7 +63,7 @@ class LbfgsSweepEngine(CompiledEngine):
 
     def _allocate_memory(self) -> AccelerationMemory:
         made = self.sweeps
-        return *super()._allocate_memory(), SweepStep(made.vertex_rows, made.allocate_memory())
+        return *super()._allocate_memory(), SweepStep(made.vertex_rows, made.allocate_memory(), self._free_components)
 
 
 class LbfgsSweepState(CompiledAccelerationState):

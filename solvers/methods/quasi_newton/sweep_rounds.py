@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from springbench.solvers.jit.kernel_compilation import jit_inner, jit_kernel
 from springbench.solvers.kernels.accelerated_descent import AccelerationWindow, accept_trial
 from springbench.solvers.kernels.descent_rounds import build_compiled_rounds
+from springbench.solvers.kernels.free_components import FreeComponents, centre_components
 from springbench.solvers.kernels.iteration_loop import REASON_ITERATIONS
 from springbench.solvers.kernels.objective_kernels import compute_max_magnitude
 from springbench.solvers.kernels.step_setup import VertexRows, read_positions
@@ -50,10 +51,12 @@ class SweepStep(NamedTuple):
     Attributes:
         vertex_rows: rows of the vertices.
         sweep_memory: packets, positions in rows of four [m], right-hand side by packets [N], and scratch.
+        free_components: components whose translation only inertia resists.
     """
 
     vertex_rows: VertexRows
     sweep_memory: SweepMemory
+    free_components: FreeComponents
 
 
 class StepArrays(NamedTuple):
@@ -120,7 +123,8 @@ def _window_decrease(state):
 def _sweep_vertices(state):
     """Do a round of sweeps, unless it raises the objective or, within round-off, the residual.
 
-    Sweeps that follow each other continue the extrapolation.
+    Sweeps that follow each other continue the extrapolation. They change vertices one by one and thus do not conserve
+    momentum, which the translation of free components to their equilibrium restores.
     """
     step, window, sweeps, arrays = state
     packets, rows, right, scratch = sweeps.sweep_memory
@@ -135,6 +139,8 @@ def _sweep_vertices(state):
         restart_sweeps(scratch, rows)
     run_unchecked_sweeps(packets, right, scratch, rows, ROUND_SWEEPS)
     _copy_vertices(scratch.older_positions, sweep_row, window.trial_position, window_row)
+    inertia = step.vertex_rows.inertia_diagonal
+    centre_components(sweeps.free_components, inertia, arrays.target, arrays.force, window_row, window.trial_position)
     if not _accept_lower_trial(step, window):
         scratch.omega[0] = MOVED
 

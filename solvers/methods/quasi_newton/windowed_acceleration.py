@@ -12,6 +12,7 @@ the solve terminates as "stalled" and its iterate stays unchanged.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Self
 
@@ -80,7 +81,7 @@ def prepare_without_barriers(
     scheme: AccelerationScheme,
     linear: LinearSolverName,
     precision: Precision,
-    engine_class: type[CompiledEngine] | None = None,
+    build_engine: Callable[[AccelerationScheme, PreparedCompiledLocalGlobal], CompiledEngine] | None = None,
 ) -> PreparedAccelerated:
     """Prepare the method that ignores the system's barrier energies, as `prepare_accelerated` does.
 
@@ -89,7 +90,7 @@ def prepare_without_barriers(
         scheme: coefficients of the acceleration.
         linear: solver of Q x = b.
         precision: floating-point type of its stored entries.
-        engine_class: class of the engine of compiled energies, `CompiledEngine` if omitted.
+        build_engine: builds the engine of compiled energies, `CompiledEngine` if omitted.
 
     Raises:
         Unsupported: for energies that the method does not support.
@@ -108,7 +109,7 @@ def prepare_without_barriers(
         return PreparedAccelerated(
             base, _build_interpreted_engine(scheme, FixedObjective(system).ignore_barriers(), base)
         )
-    engine = (engine_class or CompiledEngine)(scheme, found)
+    engine = (build_engine or CompiledEngine)(scheme, found)
     if without_vertex_contact(system) is system:
         return PreparedAccelerated(found.base, engine)
     objective = FixedObjective(system).ignore_barriers()
