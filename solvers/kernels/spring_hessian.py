@@ -12,14 +12,18 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numba import prange
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
-from springbench.solvers.jit.kernel_compilation import jit_inner, jit_kernel
+from springbench.solvers.jit.kernel_compilation import jit_inner, jit_inner_parallel, jit_kernel
 from springbench.solvers.kernels.objective_kernels import spring_direction
 from springbench.solvers.kernels.quadratic_form_kernels import add_product, add_to_diagonal
 from springbench.solvers.kernels.spring_law import transverse_stiffness
 from springbench.solvers.model.energies.element_energies import add_products, axial_hessian
 from springbench.solvers.model.step_problem import System
+
+_ZERO = np.int64(0)
+"""0 as an int64 argument: for a literal, kernels would be compiled once more."""
 
 
 class BlockIndices(NamedTuple):
@@ -185,16 +189,20 @@ def write_constant_blocks(terms, places, values):
         places: block indices.
         values: output (b, 3, 3) [N/m], overwritten.
     """
-    _write_constant_blocks(terms, places, values)
+    _write_constant_blocks(terms, places, values, (_ZERO, len(places.diagonal_block), _ZERO, len(values)))
 
 
 @jit_inner
-def _write_constant_blocks(terms, places, values):
-    values[:] = 0.0
+def _write_constant_blocks(terms, places, values, rows):
+    first_vertex, end_vertex, first_block, end_block = rows
+    values[first_block:end_block] = 0.0
     for v in places.free_vertices:
-        add_to_diagonal(values, places.diagonal_block[v], terms.inertia_diagonal[v])
+        if first_vertex <= v < end_vertex:
+            add_to_diagonal(values, places.diagonal_block[v], terms.inertia_diagonal[v])
     for q in range(len(terms.pinned_vertices)):
-        add_to_diagonal(values, places.diagonal_block[terms.pinned_vertices[q]], terms.pin_weight[q])
+        v = terms.pinned_vertices[q]
+        if first_vertex <= v < end_vertex:
+            add_to_diagonal(values, places.diagonal_block[v], terms.pin_weight[q])
 
 
 @jit_kernel
@@ -210,29 +218,59 @@ def assemble_hessian(terms, places, constant, p, tension, negative_fraction, val
         negative_fraction: factor of the springs' negative transverse parts.
         values: output (b, 3, 3) [N/m].
     """
+    rows = _ZERO, len(p), _ZERO, len(values)
+    _assemble_rows(terms, places, constant, p, tension, negative_fraction, values, rows)
+
+
+@jit_kernel
+def assemble_hessian_in_threads(terms, places, constant, p, tension, negative_fraction, values, bounds):
+    """Write what `assemble_hessian` does, in several threads.
+
+    Args:
+        terms, places, constant, p, tension, negative_fraction, values: those of `assemble_hessian`.
+        bounds: first vertex and first block of the rows of each thread, and the ends of the last one (t + 1, 2).
+    """
+    _assemble_in_threads(terms, places, constant, p, tension, negative_fraction, values, bounds)
+
+
+@jit_inner_parallel
+def _assemble_in_threads(terms, places, constant, p, tension, negative_fraction, values, bounds):
+    for part in prange(len(bounds) - 1):
+        rows = bounds[part, 0], bounds[part + 1, 0], bounds[part, 1], bounds[part + 1, 1]
+        _assemble_rows(terms, places, constant, p, tension, negative_fraction, values, rows)
+
+
+@jit_inner
+def _assemble_rows(terms, places, constant, p, tension, negative_fraction, values, rows):
+    """Write the rows of a range of vertices, whose blocks are a range, too: first and end of both."""
+    first_vertex, end_vertex, first_block, end_block = rows
     if constant is None:
-        _write_constant_blocks(terms, places, values)
+        _write_constant_blocks(terms, places, values, rows)
     else:
-        for block in range(len(values)):
+        for block in range(first_block, end_block):
             for row in range(3):
                 for column in range(3):
                     values[block, row, column] = constant[block, row, column]
     for e in range(len(terms.stiffness)):
         i, j = terms.edges[e, 0], terms.edges[e, 1]
-        if i == j:
+        has_first, has_second = first_vertex <= i < end_vertex, first_vertex <= j < end_vertex
+        if i == j or not (has_first or has_second):
             continue
         n0, n1, n2, length = spring_direction(terms, e, p)
         force = tension[e] if len(tension) else terms.stiffness[e] * (length - terms.rest_length[e])
         lateral = transverse_stiffness(terms.stiffness[e], terms.rest_length[e], force, length)
         lateral = lateral * negative_fraction if lateral < 0.0 < terms.rest_length[e] else lateral
         xx, xy, xz, yy, yz, zz = axial_hessian(terms.stiffness[e], lateral, n0, n1, n2)
-        if places.diagonal_block[i] >= 0:
-            _add_block(values, places.diagonal_block[i], 1.0, xx, xy, xz, yy, yz, zz)
-        if places.diagonal_block[j] >= 0:
-            _add_block(values, places.diagonal_block[j], 1.0, xx, xy, xz, yy, yz, zz)
-        if places.off_diagonal[e, 0] >= 0:
-            _add_block(values, places.off_diagonal[e, 0], -1.0, xx, xy, xz, yy, yz, zz)
-            _add_block(values, places.off_diagonal[e, 1], -1.0, xx, xy, xz, yy, yz, zz)
+        if has_first:
+            if places.diagonal_block[i] >= 0:
+                _add_block(values, places.diagonal_block[i], 1.0, xx, xy, xz, yy, yz, zz)
+            if places.off_diagonal[e, 0] >= 0:
+                _add_block(values, places.off_diagonal[e, 0], -1.0, xx, xy, xz, yy, yz, zz)
+        if has_second:
+            if places.diagonal_block[j] >= 0:
+                _add_block(values, places.diagonal_block[j], 1.0, xx, xy, xz, yy, yz, zz)
+            if places.off_diagonal[e, 1] >= 0:
+                _add_block(values, places.off_diagonal[e, 1], -1.0, xx, xy, xz, yy, yz, zz)
 
 
 @jit_kernel

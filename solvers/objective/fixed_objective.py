@@ -51,6 +51,7 @@ class ObjectiveKernels(NamedTuple):
     predict_positions: TypedKernel
     linearise_tensions: TypedKernel
     assemble_hessian: TypedKernel
+    assemble_hessian_in_threads: TypedKernel
     linearise_springs: TypedKernel
     multiply_hessian: TypedKernel
 
@@ -85,6 +86,7 @@ class FixedObjective:
             TypedKernel(objective_kernels.predict_positions),
             TypedKernel(spring_hessian.linearise_tensions),
             TypedKernel(spring_hessian.assemble_hessian),
+            TypedKernel(spring_hessian.assemble_hessian_in_threads),
             TypedKernel(spring_hessian.linearise_springs),
             TypedKernel(spring_hessian.multiply_hessian),
         )

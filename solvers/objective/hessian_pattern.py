@@ -54,8 +54,25 @@ class BlockMatrix:
         rows = np.repeat(np.arange(len(graph.indptr) - 1), np.diff(graph.indptr))
         self._block_keys = rows * self._num_free + graph.indices
         self.diagonal_entries = self.entry_indices(*np.tile(np.arange(3 * len(system.free_vertices)), (2, 1)))
+        self._row_bounds: dict[int, IndexArray] = {}
         self._element_indices: dict[int, tuple[IndexArray, IndexArray]] = {}
         self._index_memory: dict[int, IndexArray] = {}
+
+    def divide_rows(self, parts: int) -> IndexArray:
+        """Return ranges of rows with about equally many blocks.
+
+        Args:
+            parts: number of ranges.
+
+        Returns:
+            First vertex and first block of each range, and the ends of the last one (parts + 1, 2).
+        """
+        if parts not in self._row_bounds:
+            starts = self.graph.indptr
+            rows = np.searchsorted(starts, np.arange(parts + 1) * self.graph.nnz // parts)
+            vertices = np.append(self.block_indices.free_vertices, len(self.block_indices.diagonal_block))
+            self._row_bounds[parts] = np.stack([vertices[rows], starts[rows]], axis=1).astype(np.int64)
+        return self._row_bounds[parts]
 
     @classmethod
     def from_graph(

@@ -440,9 +440,12 @@ class Hessian:
         step, tension = self._step_objective, _TENSIONS_AT_POINT if tension is None else tension
         constant = step.constant_blocks(matrix, self._positions)
         terms, p = self._objective_terms, np.ascontiguousarray(self._positions)
+        kernel, bounds = self._kernels.assemble_hessian, ()
+        if (threads := matrix.factor.num_threads) > 1:
+            kernel, bounds = self._kernels.assemble_hessian_in_threads, (matrix.divide_rows(threads),)
         # The blocks of elements are constant in some steps only, so that their type changes.
-        assemble = spring_hessian.assemble_hessian if step.element_energies else self._kernels.assemble_hessian.call
-        assemble(terms, matrix.block_indices, constant, p, tension, float(negative_fraction), matrix.values)
+        assemble = kernel.kernel if step.element_energies else kernel.call
+        assemble(terms, matrix.block_indices, constant, p, tension, float(negative_fraction), matrix.values, *bounds)
         if step.element_energies:
             self._add_elements(matrix, projected.element_hessians if projected else self.element_hessians)
         if projected:

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import numba
 import numpy as np
 import pytest
 from scipy.sparse import csr_array, diags_array
+from springbench.harness.execution.machine_info import limit_threads
+from springbench.solvers.linalg.cholesky import block_cholesky
 from springbench.solvers.model.energies.spring_energy import Springs
 from springbench.solvers.model.step_problem import Positions, StepProblem
 from springbench.solvers.objective.fixed_objective import FixedObjective
@@ -175,6 +178,19 @@ def test_without_negative_lateral_parts_springs_are_positive_semidefinite():
     hessian = step.hessian(0.01 * p)  # nearly all springs compressed
     assert not hessian.factorise()
     assert hessian.factorise(0.0)
+
+
+@pytest.mark.parametrize("weight", ["exact", 1e4])
+def test_the_hessian_does_not_depend_on_threads(weight, monkeypatch):
+    monkeypatch.setattr(block_cholesky, "_MIN_THREADED_FLOPS", 0.0)
+    problem = build_first_problem(build_cloth(9, weight))
+    p, found = problem.initial_guess * [1.0, 1.1, 0.9], []
+    for threads in range(1, numba.config.NUMBA_NUM_THREADS + 1):  # type: ignore[attr-defined]
+        with limit_threads(threads):
+            step = StepObjective(FixedObjective(problem.system), problem)
+            found += [step.hessian(p).assemble_clamped().values for _ in range(2)]
+    for values in found[1:]:
+        np.testing.assert_array_equal(values, found[0])
 
 
 def test_a_temporary_pattern_leaves_no_trace():
