@@ -24,6 +24,10 @@ from springbench.solvers.model.step_problem import System
 IndexArray = NDArray[np.int64]
 
 
+_MIN_THREADED_BLOCKS = 70_000
+"""Blocks of a matrix from which a second thread pays off, whose start takes as long as to write some thousand blocks."""
+
+
 class BlockMatrix:
     """A matrix of 3 x 3 blocks between free vertices."""
 
@@ -57,6 +61,11 @@ class BlockMatrix:
         self._row_bounds: dict[int, IndexArray] = {}
         self._element_indices: dict[int, tuple[IndexArray, IndexArray]] = {}
         self._index_memory: dict[int, IndexArray] = {}
+
+    @property
+    def num_threads(self) -> int:
+        """Number of threads that assemble the matrix: those that factorise it, or one if that is faster."""
+        return self.factor.num_threads if len(self.values) >= _MIN_THREADED_BLOCKS else 1
 
     def divide_rows(self, parts: int) -> IndexArray:
         """Return ranges of rows with about equally many blocks.

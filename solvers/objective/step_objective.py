@@ -441,7 +441,7 @@ class Hessian:
         constant = step.constant_blocks(matrix, self._positions)
         terms, p = self._objective_terms, np.ascontiguousarray(self._positions)
         kernel, bounds = self._kernels.assemble_hessian, ()
-        if (threads := matrix.factor.num_threads) > 1:
+        if (threads := matrix.num_threads) > 1:
             kernel, bounds = self._kernels.assemble_hessian_in_threads, (matrix.divide_rows(threads),)
         # The blocks of elements are constant in some steps only, so that their type changes.
         assemble = kernel.kernel if step.element_energies else kernel.call

@@ -12,6 +12,7 @@ from springbench.harness.execution.machine_info import limit_threads
 from springbench.solvers.linalg.cholesky import block_cholesky
 from springbench.solvers.model.energies.spring_energy import Springs
 from springbench.solvers.model.step_problem import Positions, StepProblem
+from springbench.solvers.objective import hessian_pattern
 from springbench.solvers.objective.fixed_objective import FixedObjective
 from springbench.solvers.objective.step_objective import StepObjective
 from springbench.solvers.registry import SOLVERS, load_target
@@ -183,6 +184,7 @@ def test_without_negative_lateral_parts_springs_are_positive_semidefinite():
 @pytest.mark.parametrize("weight", ["exact", 1e4])
 def test_the_hessian_does_not_depend_on_threads(weight, monkeypatch):
     monkeypatch.setattr(block_cholesky, "_MIN_THREADED_FLOPS", 0.0)
+    monkeypatch.setattr(hessian_pattern, "_MIN_THREADED_BLOCKS", 0)
     problem = build_first_problem(build_cloth(9, weight))
     p, found = problem.initial_guess * [1.0, 1.1, 0.9], []
     for threads in range(1, numba.config.NUMBA_NUM_THREADS + 1):  # type: ignore[attr-defined]
