@@ -25,7 +25,7 @@ IndexArray = NDArray[np.int64]
 
 
 _MIN_THREADED_BLOCKS = 70_000
-"""Blocks of a matrix from which a second thread pays off, whose start takes as long as to write some thousand blocks."""
+"""Blocks of a matrix from which a second thread pays off; to start it takes as long as writing some thousand blocks."""
 
 
 class BlockMatrix:
