@@ -129,6 +129,19 @@ def test_a_curve_ends_at_its_time_limit_without_the_iterates_that_compile() -> N
     assert found.seconds[-1, 0] >= 0.02 * found.iterate_indices[-1]
 
 
+def test_a_curve_does_not_end_where_a_kernel_is_compiled() -> None:
+    first_calls = {4, 7}
+
+    def iterate(number: int) -> Positions:
+        if number in first_calls:
+            first_calls.remove(number)
+            sleep(0.3)
+        return towards(lambda n: 0.5**n)(number)
+
+    found = curve(ScriptedSolver(iterate), time_limit=0.2, num_rounds=1)
+    assert (found.status, first_calls) == ("ok", set())
+
+
 def test_scores_are_those_of_the_reference_and_time_stamps_ascend_in_each_round() -> None:
     prepared = SparseLocalGlobal().prepare(PROBLEM.system)
     found = curve(prepared, max_iterations=120, num_rounds=3)

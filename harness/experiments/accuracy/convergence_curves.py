@@ -46,6 +46,9 @@ DIVERGENCE_GAP = 1e6
 NUM_WARMUP_ITERATES = 2
 """Iterates whose time does not count against the limit, because they compile."""
 
+_MAX_ITERATE_SHARE = 0.5
+"""Share of the time limit in one iterate above which a pass is repeated: a kernel may have been compiled in it."""
+
 MIN_SOLVE_SECONDS = 0.1
 """Duration below which an untimed solve precedes the timed ones [s].
 
@@ -116,21 +119,15 @@ def measure_convergence(
     Raises:
         RunFailed: a timed pass ends at other positions, or another clock disagrees.
     """
-    grading = _ConvergenceMonitor(evaluator, problem, lowest_energy, max_iterations, time_limit)
-    p, spent, number, still = problem.initial_guess.copy(), 0.0, 0, 0
-    grading.add_iterate(0, p)
-    iterates = prepared.iterates(problem)
-    while not grading.status:
-        began = perf_counter()
-        following = next(iterates)
-        if number >= NUM_WARMUP_ITERATES:
-            spent += perf_counter() - began
-        number, still = number + 1, still + 1 if np.array_equal(following, p) else 0
-        np.copyto(p, following)
-        fixed = still == MAX_UNCHANGED_ITERATES
-        if is_scored_iteration(number) or fixed or spent > time_limit or number == max_iterations:
-            grading.add_iterate(number, p)
-            grading.update_status(fixed, spent)
+    grading, before = _ConvergenceMonitor(evaluator, problem, lowest_energy, max_iterations, time_limit), 0
+    spent, longest = grading.grade_pass(prepared)
+    while grading.status == "time-limit" and longest > _MAX_ITERATE_SHARE * time_limit:
+        if grading.iterate_indices[-1] <= before:
+            break
+        before = grading.iterate_indices[-1]
+        grading = _ConvergenceMonitor(evaluator, problem, lowest_energy, max_iterations, time_limit)
+        spent, longest = grading.grade_pass(prepared)
+    number, p = grading.iterate_indices[-1], grading.positions[-1]
     if spent < MIN_SOLVE_SECONDS:
         _time_iterates(prepared, problem, number, p)
     stamps, interrupted = zip(*(_time_iterates(prepared, problem, number, p) for _ in range(num_rounds)), strict=True)
@@ -169,6 +166,29 @@ class _ConvergenceMonitor:
         self.g: list[float] = []
         self.stationarity: list[float] = []
         self.status = self.reason = ""
+
+    def grade_pass(self, prepared: PreparedSolver) -> tuple[float, float]:
+        """Score the iterates of a solve until one ends the curve.
+
+        Returns:
+            Time of the solver, and of its longest iterate [s].
+        """
+        p, spent, longest, number, still = self._problem.initial_guess.copy(), 0.0, 0.0, 0, 0
+        self.add_iterate(0, p)
+        iterates = prepared.iterates(self._problem)
+        while not self.status:
+            began = perf_counter()
+            following = next(iterates)
+            if number >= NUM_WARMUP_ITERATES:
+                seconds = perf_counter() - began
+                spent, longest = spent + seconds, max(longest, seconds)
+            number, still = number + 1, still + 1 if np.array_equal(following, p) else 0
+            np.copyto(p, following)
+            fixed, is_last = still == MAX_UNCHANGED_ITERATES, number == self._max_iterations
+            if is_scored_iteration(number) or fixed or spent > self._time_limit or is_last:
+                self.add_iterate(number, p)
+                self.update_status(fixed, spent)
+        return spent, longest
 
     def add_iterate(self, number: int, p: Positions) -> None:
         finite = bool(np.isfinite(p).all())
