@@ -242,7 +242,7 @@ def _assemble_in_threads(terms, places, constant, p, tension, negative_fraction,
 
 @jit_inner
 def _assemble_rows(terms, places, constant, p, tension, negative_fraction, values, rows):
-    """Write the rows of a range of vertices, whose blocks are a range, too: first and end of both."""
+    """Write a range of rows, given by its vertices and blocks, first and end."""
     first_vertex, end_vertex, first_block, end_block = rows
     if constant is None:
         _write_constant_blocks(terms, places, values, rows)

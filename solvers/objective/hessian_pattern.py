@@ -64,7 +64,7 @@ class BlockMatrix:
 
     @property
     def num_threads(self) -> int:
-        """Number of threads that assemble the matrix: those that factorise it, or one if that is faster."""
+        """Number of threads of an assembly: that of factorisations, or one if faster."""
         return self.factor.num_threads if len(self.values) >= _MIN_THREADED_BLOCKS else 1
 
     def divide_rows(self, parts: int) -> IndexArray:

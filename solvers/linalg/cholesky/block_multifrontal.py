@@ -242,7 +242,7 @@ def _front_of(fronts, schedule, supernode, panels, scratch, thread):
 
 @jit_inner
 def _is_leaf(fronts, supernode):
-    """Return 1 if a supernode has no children, so that its update consists of one product, else 0."""
+    """Return 1 if a supernode has no children, else 0."""
     return ONE if fronts.first_child[supernode] < 0 else ZERO
 
 
