@@ -1,4 +1,4 @@
-"""Translations of components that nothing supports: where inertia and external forces are in equilibrium.
+"""Translation of unconstrained components, to where inertia and external forces are in equilibrium.
 
     t = sum over v of (m_v/dt^2 (target_v - p_v) + f_v) / sum over v of m_v/dt^2
 

@@ -119,15 +119,14 @@ def measure_convergence(
     Raises:
         RunFailed: a timed pass ends at other positions, or another clock disagrees.
     """
-    grading, before = _ConvergenceMonitor(evaluator, problem, lowest_energy, max_iterations, time_limit), 0
-    spent, longest = grading.grade_pass(prepared)
-    while grading.status == "time-limit" and longest > _MAX_ITERATE_SHARE * time_limit:
-        if grading.iterate_indices[-1] <= before:
-            break
-        before = grading.iterate_indices[-1]
-        grading = _ConvergenceMonitor(evaluator, problem, lowest_energy, max_iterations, time_limit)
+    number = 0
+    while True:
+        grading, before = _ConvergenceMonitor(evaluator, problem, lowest_energy, max_iterations, time_limit), number
         spent, longest = grading.grade_pass(prepared)
-    number, p = grading.iterate_indices[-1], grading.positions[-1]
+        number, p = grading.iterate_indices[-1], grading.positions[-1]
+        may_have_compiled = grading.status == "time-limit" and longest > _MAX_ITERATE_SHARE * time_limit
+        if not may_have_compiled or number <= before:
+            break
     if spent < MIN_SOLVE_SECONDS:
         _time_iterates(prepared, problem, number, p)
     stamps, interrupted = zip(*(_time_iterates(prepared, problem, number, p) for _ in range(num_rounds)), strict=True)

@@ -15,11 +15,11 @@ Sorensen 1983).
 
 L-BFGS runs first. Its factor of Q is in float32, unless Q is so stiff that directions would have no correct digit: an
 iteration takes 5 to 14 % less time (200 to 1100 vertices, one core with AVX-512), and directions need no more digits.
-Residuals then have relative errors of 1e-7. It is in float64 if a connected component has no pins: directions conserve
-its momentum, and after sweeps, which do not, it is translated to where inertia and external forces are in equilibrium
-(`springbench.solvers.kernels.free_components`). A solve whose initial guess is the current
-positions starts where the objective is lowest: there, at the inertial target (motion without forces) or at the inertial
-prediction (motion without springs). Near the minimum, segments of five iterations alternate with rounds of four sweeps
+Residuals then have relative errors of 1e-7. The factor is in float64 if a connected component has no pins: directions
+then conserve its momentum. Sweeps do not; after them, the component is translated to its equilibrium
+(`springbench.solvers.kernels.free_components`). A solve whose initial guess is the current positions starts where the
+objective is lowest: there, at the inertial target (motion without forces) or at the inertial prediction (motion without
+springs). Near the minimum, segments of five iterations alternate with rounds of four sweeps
 of vertex block descent (`springbench.solvers.methods.quasi_newton.sweep_rounds`). More rounds of sweeps follow as long
 as each decreases the objective more per cost than the last segment did, or the residual to 0.32 of it. Near means that
 an iteration of L-BFGS decreases the objective by at most 5e-5 of the decrease since the initial guess, and by at most
