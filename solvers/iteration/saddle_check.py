@@ -19,8 +19,10 @@ from functools import cached_property
 
 import numpy as np
 from springbench.solvers.iteration.vertex_terms import compute_anchor_stiffness
+from springbench.solvers.jit.typed_kernel import TypedKernel, as_kernel_array
 from springbench.solvers.kernels import curvature_search
 from springbench.solvers.kernels.curvature_search import EXHAUSTED_RATIO, CurvatureScratch
+from springbench.solvers.kernels.hessian_packets import HessianPackets
 from springbench.solvers.kernels.line_search_conditions import is_armijo_step
 from springbench.solvers.linalg.krylov import NEGATIVE_CURVATURE, ConjugateGradientIteration
 from springbench.solvers.model.step_problem import Positions, StepProblem
@@ -48,6 +50,7 @@ class SaddleCheck:
         self._anchor_stiffness = compute_anchor_stiffness(system)
         self._linear_terms = np.empty((len(self._fixed_objective.springs.stiffness), 4))
         self._negative_stiffness = np.empty(system.num_vertices)
+        self._bound_by_springs = TypedKernel(curvature_search.bound_by_springs)
 
     def find_lower_point(self, problem: StepProblem, p: Positions, num_iterations: int) -> Positions | None:
         """Return a lower point to which negative curvature leads, or None if none was found.
@@ -99,16 +102,21 @@ class SaddleCheck:
             curvature_search.fill_preconditioner(*arguments, anchor_stiffness, scratch)
             found = _InterpretedSearch(hessian, scratch).find_curvature(max_products)
         else:
-            found = curvature_search.search_compiled(arguments, anchor_stiffness, max_products, scratch)
-        size = float(np.abs(scratch.direction).max(initial=0.0))
-        return (scratch.direction / size, found / size**2) if found < 0.0 else None
+            found = curvature_search.search_compiled(*arguments, anchor_stiffness, self._packets, max_products, scratch)
+        direction = scratch.direction[: len(p), :3]
+        size = float(np.abs(direction).max(initial=0.0))
+        return (direction / size, found / size**2) if found < 0.0 else None
 
     def is_bounded_by_springs(self, p: Positions) -> bool:
         """Return whether the bound over springs rules out negative curvature at p (n, 3) [m]."""
-        terms = self._fixed_objective.objective_terms
-        return self._has_springs_alone and curvature_search.bound_by_springs(
-            terms, p, self._anchor_stiffness, self._linear_terms, self._negative_stiffness
+        scratch = self._linear_terms, self._negative_stiffness
+        return self._has_springs_alone and self._bound_by_springs.call(
+            self._fixed_objective.objective_terms, as_kernel_array(p), self._anchor_stiffness, *scratch
         )
+
+    @cached_property
+    def _packets(self) -> HessianPackets:
+        return HessianPackets.from_springs(self._fixed_objective.springs, self._anchor_stiffness)
 
     @cached_property
     def _scratch(self) -> CurvatureScratch:
@@ -141,7 +149,8 @@ class _InterpretedSearch(ConjugateGradientIteration):
     def update_direction(self, product: float, previous_product: float) -> float:
         """Update the direction; return the curvature along it."""
         curvature_search.update_search_direction(self._scratch, product / previous_product)
-        self._scratch.product[:] = self._hessian.matvec(self._scratch.direction)
+        free = np.s_[: len(self._scratch.residual), :3]
+        self._scratch.product[free] = self._hessian.matvec(np.ascontiguousarray(self._scratch.direction[free]))
         return curvature_search.measure_curvature(self._scratch)
 
     def update_iterate(self, product: float, curvature: float) -> float:

@@ -20,8 +20,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from springbench.solvers.jit.kernel_compilation import jit_inner, jit_kernel
-from springbench.solvers.kernels.spring_hessian import linearise_springs, multiply_hessian
+from springbench.solvers.kernels.hessian_packets import fill_linear_springs, multiply_packets
+from springbench.solvers.kernels.quadratic_form_kernels import add_product
+from springbench.solvers.kernels.spring_hessian import linearise_springs
 from springbench.solvers.linalg.krylov import NEGATIVE_CURVATURE, compile_cg_loop
+from springbench.solvers.linalg.memory import allocate_aligned
+from springbench.solvers.model.energies.element_energies import add_products
 
 CURVATURE_ROUNDOFF = 16.0 * np.finfo(np.float64).eps
 """Curvature relative to the absolute terms of its sum below which it is round-off."""
@@ -40,7 +44,9 @@ class CurvatureScratch(NamedTuple):
         inverse_blocks: packed 3 x 3 blocks of the preconditioner (n, 6) [m/N], zero for fixed vertices.
         absolute_stiffness: sum of the absolute terms of the diagonal (n,) [N/m].
         start: right-hand side b (n, 3), not overwritten.
-        residual, direction, product: (n, 3); the direction is the one found, the product also contains z.
+        residual: (n, 3).
+        direction, product: (n + 2, 4), zero in the last two rows and the last column; the direction is the one found,
+            the product also contains z.
     """
 
     inverse_blocks: NDArray[np.float64]
@@ -54,8 +60,9 @@ class CurvatureScratch(NamedTuple):
     def from_size(cls, num_vertices: int) -> CurvatureScratch:
         """Allocate scratch; the right-hand side is the same in each call and has no symmetry."""
         start = np.random.default_rng(0).normal(size=(num_vertices, 3))
-        residual, direction, product = np.zeros((3, num_vertices, 3))
-        return cls(np.empty((num_vertices, 6)), np.empty(num_vertices), start, residual, direction, product)
+        direction, product = (allocate_aligned(4 * (num_vertices + 2)).reshape(-1, 4) for _ in range(2))
+        blocks, sizes = np.empty((num_vertices, 6)), np.empty(num_vertices)
+        return cls(blocks, sizes, start, np.empty_like(start), direction, product)
 
 
 @jit_kernel
@@ -295,7 +302,7 @@ def update_search_direction(scratch, ratio):
 @jit_inner
 def _update_direction(scratch, ratio):
     p, z = scratch.direction, scratch.product
-    for v in range(len(p)):
+    for v in range(len(scratch.residual)):
         for c in range(3):
             p[v, c] = z[v, c] + ratio * p[v, c]
 
@@ -309,7 +316,7 @@ def measure_curvature(scratch):
 @jit_inner
 def _measure_curvature(scratch):
     p, q, curvature, size = scratch.direction, scratch.product, 0.0, 0.0
-    for v in range(len(p)):
+    for v in range(len(scratch.residual)):
         curvature += p[v, 0] * q[v, 0] + p[v, 1] * q[v, 1] + p[v, 2] * q[v, 2]
         size += scratch.absolute_stiffness[v] * (p[v, 0] ** 2 + p[v, 1] ** 2 + p[v, 2] ** 2)
     return curvature if abs(curvature) > CURVATURE_ROUNDOFF * size else 0.0
@@ -336,9 +343,11 @@ def _update_residual(scratch, step_size):
 
 @jit_inner
 def _compiled_update_direction(state, product, before):
-    hessian, scratch, _ = state
+    (form, joined, curvature, packets), scratch, _ = state
     _update_direction(scratch, product / before)
-    multiply_hessian(*hessian, scratch.direction, scratch.product)
+    multiply_packets(packets, scratch.direction, scratch.product)
+    add_product(form, scratch.direction, scratch.product)
+    add_products(joined, curvature, scratch.direction, scratch.product)
     return _measure_curvature(scratch)
 
 
@@ -361,19 +370,21 @@ _search_loop = compile_cg_loop(_compiled_update_direction, _compiled_update_iter
 
 
 @jit_kernel
-def search_compiled(hessian, anchor_stiffness, max_products, scratch):
+def search_compiled(terms, linear, form, joined, curvature, anchor_stiffness, packets, max_products, scratch):
     """Search for negative curvature of terms with an element-wise form.
 
     Args:
-        hessian: arguments of `multiply_hessian`.
-        anchor_stiffness: stiffness of inertia and pins (n,) [N/m], infinite at fixed vertices.
+        terms, linear, form, joined, curvature, anchor_stiffness: those of `fill_preconditioner`.
+        packets: packets of the springs; their linearised springs are overwritten.
         max_products: maximum number of products with the Hessian.
         scratch: scratch; its direction is the one found.
 
     Returns:
         The curvature x'Hx along the direction [J], 0 if none is negative.
     """
-    _fill_preconditioner(*hessian, anchor_stiffness, scratch)
+    _fill_preconditioner(terms, linear, form, joined, curvature, anchor_stiffness, scratch)
+    fill_linear_springs(packets, linear)
     product = _start_search(scratch)
+    hessian = form, joined, curvature, packets
     _, ended = _search_loop((hessian, scratch, EXHAUSTED_RATIO * product), product, max_products)
     return _measure_curvature(scratch) if ended == NEGATIVE_CURVATURE else 0.0

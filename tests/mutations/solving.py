@@ -48,6 +48,13 @@ _TABLE = (
         _SADDLES,
     ),
     (
+        "hessian-packets-of-other-springs",
+        "solvers/kernels/hessian_packets.py",
+        "spring = max(spring, ~spring)",
+        "spring = abs(spring)",
+        _SADDLES,
+    ),
+    (
         "hybrid-ends-at-saddles",
         "solvers/methods/newton/hybrid_newton.py",
         "            control.is_minimum\n            or self._prepared",
