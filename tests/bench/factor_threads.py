@@ -7,7 +7,8 @@ An iteration consists of the gradient, the Hessian, its factorisation, the solve
 sheet that is stretched by 5 %, so that the Hessian is positive definite. PARDISO, an optional dependency (`pardiso`),
 computes the numeric factorisation of that Hessian alone. Measurements of both programs with one and two threads
 alternate. A pause separates the programs, so that waiting threads of one do not spin during the measurement of the
-other. The table has median wall times, and medians of the rounds' ratios with their quartiles. It requires two idle
+other. Untimed calls precede each measurement, since the threads of a program that has slept run on one core until the
+system distributes them. The table has median wall times, and medians of the rounds' ratios with their quartiles. It requires two idle
 cores.
 """
 
@@ -38,6 +39,9 @@ SCENE = Path(__file__).parents[2] / "configs" / "scenes" / "hanging-cloth.yaml"
 
 PAUSE = 0.3
 """Pause between the two programs [s]: waiting threads of Intel's runtime spin for 0.2 s."""
+
+WARM_UP = 0.1
+"""Duration of the untimed calls before a measurement [s], of at least one call."""
 
 
 def build_newton_iteration(size: int) -> tuple[Callable[[], object], StepObjective, np.ndarray]:
@@ -86,10 +90,17 @@ def _measure_seconds(work: Callable[[], object], repeats: int) -> float:
     return (perf_counter() - begin) / repeats
 
 
+def _warm_up(work: Callable[[], object]) -> None:
+    end = perf_counter() + WARM_UP
+    work()
+    while perf_counter() < end:
+        work()
+
+
 def _measure_interleaved(programs: list[list[Callable[[], object]]], rounds: int) -> np.ndarray:
     """Measure wall times (rounds, works) [s] of the works of several programs.
 
-    The order of the works alternates by round. An untimed call precedes each, and a pause follows each program.
+    The order of the works alternates by round. Untimed calls precede each, and a pause follows each program.
     """
     seconds = np.empty((rounds, sum(map(len, programs))))
     for work in (work for works in programs for work in works):
@@ -99,7 +110,7 @@ def _measure_interleaved(programs: list[list[Callable[[], object]]], rounds: int
         first = 0
         for works, count in zip(programs, repeats, strict=True):
             for i in range(len(works))[:: 1 if k % 2 == 0 else -1]:
-                works[i]()
+                _warm_up(works[i])
                 seconds[k, first + i] = _measure_seconds(works[i], count)
             first += len(works)
             if len(programs) > 1:
