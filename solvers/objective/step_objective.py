@@ -519,6 +519,11 @@ class Hessian:
             curvature,
         )
 
+    def is_finite(self) -> bool:
+        """Return whether all entries of the exact Hessian are finite."""
+        with np.errstate(all="ignore"):
+            return bool(np.isfinite(self.matvec(np.ones_like(self._positions))).all())
+
     def matvec(self, x: Positions) -> Positions:
         """Return the exact Hessian times x (n, 3).
 

@@ -8,8 +8,8 @@ sheet that is stretched by 5 %, so that the Hessian is positive definite. PARDIS
 computes the numeric factorisation of that Hessian alone. Measurements of both programs with one and two threads
 alternate. A pause separates the programs, so that waiting threads of one do not spin during the measurement of the
 other. Untimed calls precede each measurement, since the threads of a program that has slept run on one core until the
-system distributes them. The table has median wall times, and medians of the rounds' ratios with their quartiles. It requires two idle
-cores.
+system distributes them. The table has median wall times, and medians of the rounds' ratios with their quartiles. It
+requires two idle cores.
 """
 
 from __future__ import annotations

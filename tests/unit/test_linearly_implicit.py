@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
@@ -23,10 +24,10 @@ from springbench.harness.scenes.mesh.chain_mesh import ChainMesh
 from springbench.harness.scenes.mesh.grid_mesh import GridMesh
 from springbench.harness.scenes.scene_builder import Scene, build_scene
 from springbench.harness.scenes.scene_spec import SceneSpec
-from springbench.harness.simulation.time_loop import build_initial_state, prepare, simulate_scene
+from springbench.harness.simulation.time_loop import build_initial_state, build_problem, prepare, simulate_scene
 from springbench.solvers.methods.newton.newton_direct import NewtonSolver
 from springbench.solvers.model.integrators import Motion
-from springbench.solvers.model.step_problem import StopRule, Unsupported
+from springbench.solvers.model.step_problem import NotPositiveDefinite, StopRule, Unsupported
 from springbench.solvers.registry import SOLVERS, load_target
 
 END, ONCE = 0.3, StopRule(1)
@@ -126,6 +127,25 @@ def test_the_linearised_step_is_that_of_baraff_and_witkin():
     wanted[inside] += dt * dv
     found = run(scene, "baraff-witkin")[-1].positions
     np.testing.assert_allclose(found.ravel(), wanted, rtol=0, atol=1e-13)  # round-off of positions of about 1 m
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("baraff-witkin", "at the start of the step the Hessian has entries that are not finite"),
+        ("ros2", "0 s after the start of the frame the Hessian has entries that are not finite"),
+    ],
+)
+def test_a_step_without_a_factor_names_the_cause(name: str, message: str):
+    integrator = "implicit-euler" if name == "baraff-witkin" else "substepping"
+    scene = build_unit_scene(SOFT, FIRST_PIN, integrator=integrator)
+    problem = build_problem(scene, build_initial_state(scene), "previous")
+    p = 1e200 * problem.current_positions  # squared lengths overflow
+    start = replace(problem.step_start, positions=p)
+    with pytest.raises(NotPositiveDefinite, match=message):
+        prepare(scene, load_target(SOLVERS[name])()).solve(
+            replace(problem, current_positions=p, step_start=start), ONCE
+        )
 
 
 @pytest.mark.parametrize(("name", "saved"), [("baraff-witkin", 0.01), ("ros2", 0.01), ("rodas", 0.01), ("ros3p", 0.8)])

@@ -71,6 +71,18 @@ def factorise_shifted(
     return None
 
 
+def explain_missing_factor(hessian: Hessian, diagonal_name: str) -> str:
+    """Explain why no Hessian of SHIFT_SCHEDULE has a factor.
+
+    Args:
+        hessian: the Hessian at a point.
+        diagonal_name: name of the diagonal whose multiples were added.
+    """
+    if not hessian.is_finite():
+        return "the Hessian has entries that are not finite"
+    return f"the Hessian is indefinite even with {SHIFT_SCHEDULE[-1][1]:g} times {diagonal_name}"
+
+
 class RegularisationRule(Protocol):
     """The regularisation in one solve."""
 

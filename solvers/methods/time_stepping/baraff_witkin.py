@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from springbench.solvers.contact.half_space.vertex_contact import is_vertex_contact
 from springbench.solvers.iteration.iterative_solver import IterativeSolver, SolverState
 from springbench.solvers.iteration.solver_info import Citation, SolverInfo
-from springbench.solvers.methods.newton.hessian_regularisation import factorise_shifted
+from springbench.solvers.methods.newton.hessian_regularisation import explain_missing_factor, factorise_shifted
 from springbench.solvers.methods.time_stepping.explicit_forces import SingleIterateState
 from springbench.solvers.model import system_matrix_assembly
 from springbench.solvers.model.barrier_energy import is_barrier_energy
@@ -107,5 +107,6 @@ class PreparedBaraffWitkin(IterativeSolver):
         p = step.apply_exact_pins(problem.current_positions)
         hessian = step.hessian(p)
         if factorise_shifted(hessian, self.system_diagonal) is None:
-            raise NotPositiveDefinite("the Hessian at the step's start is not finite, or no multiple of Q balances it")
+            cause = explain_missing_factor(hessian, "the diagonal of Q")
+            raise NotPositiveDefinite(f"at the start of the step {cause}")
         return SingleIterateState(step.apply_exact_pins(p - hessian.solve(step.gradient(p))), None)

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from springbench.solvers.iteration import vertex_terms
 from springbench.solvers.iteration.iterative_solver import IterativeSolver, SolverState
 from springbench.solvers.iteration.solver_info import Citation, SolverInfo
-from springbench.solvers.methods.newton.hessian_regularisation import factorise_shifted
+from springbench.solvers.methods.newton.hessian_regularisation import explain_missing_factor, factorise_shifted
 from springbench.solvers.methods.time_stepping.explicit_forces import SingleIterateState
 from springbench.solvers.methods.time_stepping.rosenbrock_tableaus import (
     RODAS_TABLEAU,
@@ -271,10 +271,8 @@ class PreparedRosenbrock(IterativeSolver):
             for k in range(self.refinement_factor):
                 made = within.try_step(p, v, length, require_exact=False)
                 if made is None:
-                    raise NotPositiveDefinite(
-                        f"after {k * frame / self.refinement_factor:.6g} s of the frame the Hessian is not finite, or "
-                        "nothing balances it"
-                    )
+                    cause = within.explain_failure(p)
+                    raise NotPositiveDefinite(f"{k * length:.6g} s after the start of the frame {cause}")
                 p, v = made.positions, made.velocity
             return within.apply_pins(p, 1.0), v, AdaptiveStepStats(self.refinement_factor, 0, length, frame)
         t, accepted, rejected, h, before = 0.0, 0, 0, min(frame, h or frame), 1.0
@@ -337,6 +335,10 @@ class _FrameIntegration:
         with np.errstate(over="ignore", invalid="ignore"):
             found = (sum(float((x**2).sum()) for x in parts) / max(1, 3 * len(self._free))) ** 0.5
         return found if np.isfinite(found) else np.inf
+
+    def explain_failure(self, p: Positions) -> str:
+        """Explain why `try_step` finds no factor at positions p (n, 3) [m]."""
+        return explain_missing_factor(self._step.hessian(p), "the inertia")
 
     def try_step(self, p: Positions, v: Positions, h: float, *, require_exact: bool = True) -> _StepResult | None:
         """Attempt one step.
