@@ -16,6 +16,7 @@ from springbench.solvers.contact.geometry.distance import (
 from springbench.solvers.simd.front_tiles import TILE_ROWS
 from springbench.solvers.simd.spring_descent import SHORT_SPRING
 from springbench.solvers.simd.spring_packets import LANES, RHS_STRIDE
+from springbench.solvers.simd.spring_products import LINEAR_STRIDE
 
 
 def reject_packet(packets, number, x, right, out):
@@ -45,6 +46,22 @@ def compute_squared_norm(packets, number, x, measure):
             v0, v1, v2 = x[i] - x[j], x[i + 1] - x[j + 1], x[i + 2] - x[j + 2]
             total += 0.5 * weights[kinds[entry] + LANES + lane] * (v0 * v0 + v1 * v1 + v2 * v2)
     return total
+
+
+def multiply_springs(packets, linear, diagonal, number, x, out):
+    """Write the products of a packet's vertices with the Hessian of springs."""
+    x, out = x.reshape(-1), out.reshape(-1)
+    for lane in range(LANES):
+        i, h = packets.row_offset[LANES * number + lane], diagonal[LANES * number + lane]
+        s0, s1, s2 = h * x[i], h * x[i + 1], h * x[i + 2]
+        for entry in range(packets.packet_start[number], packets.packet_start[number + 1]):
+            j, at = packets.neighbour_offset[LANES * entry + lane], LINEAR_STRIDE * entry + lane
+            v0, v1, v2 = x[i] - x[j], x[i + 1] - x[j + 1], x[i + 2] - x[j + 2]
+            m0, m1, m2 = linear[at], linear[at + LANES], linear[at + 2 * LANES]
+            stretch, lateral = m0 * v0 + m1 * v1 + m2 * v2, linear[at + 3 * LANES]
+            s0, s1, s2 = s0 + lateral * v0, s1 + lateral * v1, s2 + lateral * v2
+            s0, s1, s2 = s0 + stretch * m0, s1 + stretch * m1, s2 + stretch * m2
+        out[i], out[i + 1], out[i + 2] = s0, s1, s2
 
 
 def step_vertices(packets, number, x, right, majorant, near):

@@ -32,7 +32,14 @@ from springbench.harness.scenes.collision_primitives import find_collision_primi
 from springbench.harness.simulation.time_loop import build_initial_state, build_problem
 from springbench.solvers.contact import collisions
 from springbench.solvers.contact.collision_mesh import CollisionMesh
-from springbench.solvers.kernels import accelerated_descent, spring_local_step, spring_objective
+from springbench.solvers.iteration.saddle_check import SaddleCheck
+from springbench.solvers.kernels import (
+    accelerated_descent,
+    curvature_search,
+    hessian_packets,
+    spring_local_step,
+    spring_objective,
+)
 from springbench.solvers.linalg.cholesky import (
     block_cholesky,
     block_multifrontal,
@@ -46,6 +53,7 @@ from springbench.solvers.linalg.multigrid.multigrid_pcg import ConjugateGradient
 from springbench.solvers.methods.quasi_newton import accelerated_step
 from springbench.solvers.methods.vertex_block import vbd_sweeps
 from springbench.solvers.model.step_problem import Positions
+from springbench.solvers.objective.fixed_objective import FixedObjective
 
 from tests.bench import plain
 from tests.bench.gates import STOP, build_sheet, prepare_solver
@@ -173,6 +181,22 @@ def build_descent_cases() -> Iterator[KernelCase]:
     yield KernelCase("objective and gradient", spring_objective.value_and_descent, descent, rejecting, (4,))
 
 
+def build_product_cases() -> Iterator[KernelCase]:
+    """Yield the kernel of products with the Hessian, on packets of eight vertices with their springs."""
+    scene = build_sheet(SIZE)
+    problem = build_problem(scene, build_initial_state(scene), "previous")
+    check = SaddleCheck(FixedObjective(scene.system))
+    pressed = 0.9 * scene.mesh.rest_positions
+
+    def search() -> object:
+        return check.find_negative_curvature(problem, pressed, 1)
+
+    *_, packets, _, scratch = capture_arguments(curvature_search, "search_compiled", search)
+    arguments = packets, scratch.direction, scratch.product
+    product = {"write_spring_products": plain.multiply_springs}
+    yield KernelCase("product with the Hessian", hessian_packets.multiply_packets, arguments, product, (2,))
+
+
 def build_dot_cases() -> Iterator[KernelCase]:
     """Yield the kernel of dot products of the vectors of L-BFGS."""
     _, window, _, _ = capture_arguments(accelerated_step, "run_solve", build_solve("lbfgs"))
@@ -259,6 +283,7 @@ def build_distance_cases() -> Iterator[KernelCase]:
 CASES = {
     "spring_forces": build_spring_cases,
     "spring_descent": build_descent_cases,
+    "spring_products": build_product_cases,
     "dot_products": build_dot_cases,
     "vbd_packets": build_vbd_cases,
     "panel_products": build_supernodal_cases,
