@@ -14,12 +14,16 @@ from contextlib import contextmanager
 from functools import cache
 from typing import Any
 
+import numpy as np
 from numba import njit, types  # noqa: TID251
 from numba.core.registry import CPUDispatcher
 from numba.core.targetconfig import TargetConfig
 from numba.core.typing.templates import signature
 from springbench.solvers.jit.inline_linking import KernelCompiler, LinkedCompiler, ParallelCompiler
 from springbench.solvers.jit.kernel_cache import KernelCache
+
+ZERO, ONE = np.int64(0), np.int64(1)
+"""0 and 1 as int64 arguments of kernels, which would be compiled once more for literals."""
 
 _no_wrapper_options: Any = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 _linked_options: Any = {**_no_wrapper_options, "pipeline_class": LinkedCompiler}

@@ -15,15 +15,12 @@ import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
-from springbench.solvers.jit.kernel_compilation import jit_inner, jit_inner_parallel, jit_kernel
+from springbench.solvers.jit.kernel_compilation import ZERO, jit_inner, jit_inner_parallel, jit_kernel
 from springbench.solvers.kernels.objective_kernels import spring_direction
 from springbench.solvers.kernels.quadratic_form_kernels import add_product, add_to_diagonal
 from springbench.solvers.kernels.spring_law import transverse_stiffness
-from springbench.solvers.model.energies.element_energies import add_products, axial_hessian
+from springbench.solvers.model.energies.element_energies import add_products, add_symmetric_block, axial_hessian
 from springbench.solvers.model.step_problem import System
-
-_ZERO = np.int64(0)
-"""0 as an int64 argument: for a literal, kernels would be compiled once more."""
 
 
 class BlockIndices(NamedTuple):
@@ -166,20 +163,6 @@ def linearise_tensions(terms, p, d, out):
         out[e] = terms.stiffness[e] * (length - terms.rest_length[e] + stretch)
 
 
-@jit_inner
-def _add_block(values, block, sign, xx, xy, xz, yy, yz, zz):
-    """Add sign times a symmetric block."""
-    values[block, 0, 0] += sign * xx
-    values[block, 0, 1] += sign * xy
-    values[block, 0, 2] += sign * xz
-    values[block, 1, 0] += sign * xy
-    values[block, 1, 1] += sign * yy
-    values[block, 1, 2] += sign * yz
-    values[block, 2, 0] += sign * xz
-    values[block, 2, 1] += sign * yz
-    values[block, 2, 2] += sign * zz
-
-
 @jit_kernel
 def write_constant_blocks(terms, places, values):
     """Write the stiffness of inertia and penalty pins to the blocks of a matrix.
@@ -189,7 +172,7 @@ def write_constant_blocks(terms, places, values):
         places: block indices.
         values: output (b, 3, 3) [N/m], overwritten.
     """
-    _write_constant_blocks(terms, places, values, (_ZERO, len(places.diagonal_block), _ZERO, len(values)))
+    _write_constant_blocks(terms, places, values, (ZERO, len(places.diagonal_block), ZERO, len(values)))
 
 
 @jit_inner
@@ -218,7 +201,7 @@ def assemble_hessian(terms, places, constant, p, tension, negative_fraction, val
         negative_fraction: factor of the springs' negative transverse parts.
         values: output (b, 3, 3) [N/m].
     """
-    rows = _ZERO, len(p), _ZERO, len(values)
+    rows = ZERO, len(p), ZERO, len(values)
     _assemble_rows(terms, places, constant, p, tension, negative_fraction, values, rows)
 
 
@@ -263,14 +246,14 @@ def _assemble_rows(terms, places, constant, p, tension, negative_fraction, value
         xx, xy, xz, yy, yz, zz = axial_hessian(terms.stiffness[e], lateral, n0, n1, n2)
         if has_first:
             if places.diagonal_block[i] >= 0:
-                _add_block(values, places.diagonal_block[i], 1.0, xx, xy, xz, yy, yz, zz)
+                add_symmetric_block(values, places.diagonal_block[i], 1.0, xx, xy, xz, yy, yz, zz)
             if places.off_diagonal[e, 0] >= 0:
-                _add_block(values, places.off_diagonal[e, 0], -1.0, xx, xy, xz, yy, yz, zz)
+                add_symmetric_block(values, places.off_diagonal[e, 0], -1.0, xx, xy, xz, yy, yz, zz)
         if has_second:
             if places.diagonal_block[j] >= 0:
-                _add_block(values, places.diagonal_block[j], 1.0, xx, xy, xz, yy, yz, zz)
+                add_symmetric_block(values, places.diagonal_block[j], 1.0, xx, xy, xz, yy, yz, zz)
             if places.off_diagonal[e, 1] >= 0:
-                _add_block(values, places.off_diagonal[e, 1], -1.0, xx, xy, xz, yy, yz, zz)
+                add_symmetric_block(values, places.off_diagonal[e, 1], -1.0, xx, xy, xz, yy, yz, zz)
 
 
 @jit_kernel

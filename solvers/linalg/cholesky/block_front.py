@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from springbench.solvers.jit.kernel_compilation import jit_inner
+from springbench.solvers.jit.kernel_compilation import ONE, ZERO, jit_inner
 from springbench.solvers.simd.front_tiles import (
     TILE_COLUMNS,
     TILE_ROWS,
@@ -27,9 +27,6 @@ PANEL_DEPTH, ROW_BLOCK_HEIGHT = 192, 128
 
 _MIN_PART_HEIGHT = 32
 """Least height of the row blocks of parts that threads share: four vectors."""
-
-ZERO, ONE = np.int64(0), np.int64(1)
-"""0 and 1 as int64 arguments: for literals, kernels would be compiled once more."""
 
 _PIVOT_ROUNDOFF = 4.0 * np.finfo(np.float64).eps
 """Pivots below this fraction of the matrix entry are round-off."""

@@ -21,10 +21,8 @@ from typing import NamedTuple
 import numpy as np
 from numba import prange
 from numpy.typing import NDArray
-from springbench.solvers.jit.kernel_compilation import jit_inner, jit_inner_parallel, jit_kernel
+from springbench.solvers.jit.kernel_compilation import ONE, ZERO, jit_inner, jit_inner_parallel, jit_kernel
 from springbench.solvers.linalg.cholesky.block_front import (
-    ONE,
-    ZERO,
     DenseFront,
     clear_lower_triangle,
     eliminate_front,

@@ -188,6 +188,27 @@ class JoinedElements(NamedTuple):
         )
 
 
+@jit_inner
+def add_symmetric_block(values, block, factor, xx, xy, xz, yy, yz, zz):
+    """Add a multiple of a symmetric block.
+
+    Args:
+        values: blocks (b, 3, 3) [N/m], updated.
+        block: index of the block.
+        factor: multiple.
+        xx, xy, xz, yy, yz, zz: upper triangle [N/m].
+    """
+    values[block, 0, 0] += factor * xx
+    values[block, 0, 1] += factor * xy
+    values[block, 0, 2] += factor * xz
+    values[block, 1, 0] += factor * xy
+    values[block, 1, 1] += factor * yy
+    values[block, 1, 2] += factor * yz
+    values[block, 2, 0] += factor * xz
+    values[block, 2, 1] += factor * yz
+    values[block, 2, 2] += factor * zz
+
+
 @jit_kernel
 def add_blocks(elements, block_indices, hessians, values):
     """Add the second derivatives of elements to matrix blocks.
@@ -207,17 +228,8 @@ def add_blocks(elements, block_indices, hessians, values):
         for a in range(width):
             for b in range(width):
                 block, c = block_indices[e, a * width + b], elements.coefficients[e, a] * elements.coefficients[e, b]
-                if block < 0:
-                    continue
-                values[block, 0, 0] += c * xx
-                values[block, 0, 1] += c * xy
-                values[block, 0, 2] += c * xz
-                values[block, 1, 0] += c * xy
-                values[block, 1, 1] += c * yy
-                values[block, 1, 2] += c * yz
-                values[block, 2, 0] += c * xz
-                values[block, 2, 1] += c * yz
-                values[block, 2, 2] += c * zz
+                if block >= 0:
+                    add_symmetric_block(values, block, c, xx, xy, xz, yy, yz, zz)
 
 
 @jit_inner
