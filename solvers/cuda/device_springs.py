@@ -57,25 +57,25 @@ class DeviceLanes(NamedTuple):
     padding_end_row: int
 
     @classmethod
-    def from_packets(cls, stream: DeviceStream, bundles: SpringPackets, padding_row: int, real: Any) -> DeviceLanes:
+    def from_packets(cls, stream: DeviceStream, packets: SpringPackets, padding_row: int, real: Any) -> DeviceLanes:
         """Copy packets of springs to the device.
 
         Args:
             stream: stream of the copies.
-            bundles: packets on the host; their strain limits and dashpots are not copied.
+            packets: packets on the host; their strain limits and dashpots are not copied.
             padding_row: row of the padding lanes; the next row is that of the ends of padding springs.
             real: floating-point type of the kernels, for their weights and spring vectors.
         """
-        entries = len(bundles.neighbour_offset)
-        direction = bundles.rest_direction if len(bundles.rest_direction) else np.zeros((1, 3))
+        entries = len(packets.neighbour_offset)
+        direction = packets.rest_direction if len(packets.rest_direction) else np.zeros((1, 3))
         return cls(
-            stream.upload_array(bundles.row_offset // 4, np.int32),
-            stream.upload_array(bundles.packet_start, np.int32),
-            stream.upload_array(_nonempty_array(bundles.neighbour_offset // 4), np.int32),
-            stream.upload_array(_nonempty_array(bundles.weight_offset), np.int32),
-            stream.upload_array(_nonempty_array(bundles.weights), real),
-            stream.upload_array(_nonempty_array(bundles.weights), np.float64),
-            stream.upload_array(_nonempty_array(bundles.spring_index), np.int32),
+            stream.upload_array(packets.row_offset // 4, np.int32),
+            stream.upload_array(packets.packet_start, np.int32),
+            stream.upload_array(_nonempty_array(packets.neighbour_offset // 4), np.int32),
+            stream.upload_array(_nonempty_array(packets.weight_offset), np.int32),
+            stream.upload_array(_nonempty_array(packets.weights), real),
+            stream.upload_array(_nonempty_array(packets.weights), np.float64),
+            stream.upload_array(_nonempty_array(packets.spring_index), np.int32),
             stream.upload_array(direction, np.float64),
             stream.allocate_zeros((3, max(1, entries)), real),
             padding_row,
@@ -116,16 +116,16 @@ def _nonempty_array(array: NDArray[Any]) -> NDArray[Any]:
     return array if len(array) else np.zeros(1, array.dtype)
 
 
-def compute_spring_bytes(bundles: SpringPackets, real: Any) -> int:
+def compute_spring_bytes(packets: SpringPackets, real: Any) -> int:
     """Return the bytes of the lanes on the device.
 
     Args:
-        bundles: packets on the host.
+        packets: packets on the host.
         real: floating-point type of the kernels.
     """
     size = np.dtype(real).itemsize
     return (
-        len(bundles.neighbour_offset) * (8 + 3 * size) + 8 * len(bundles.row_offset) + (8 + size) * bundles.weights.size
+        len(packets.neighbour_offset) * (8 + 3 * size) + 8 * len(packets.row_offset) + (8 + size) * packets.weights.size
     )
 
 

@@ -23,13 +23,13 @@ class HessianPackets(NamedTuple):
     """The Hessian in packets of the vertices that move.
 
     Attributes:
-        bundles: packets of the springs.
+        spring_packets: packets of the springs.
         padding_offset: offset of the row n + 1, at which padding springs end.
         diagonal: stiffness of inertia and pins in each lane (8 b,) [N/m].
         linear: linearised springs of each entry, zero in padding lanes.
     """
 
-    bundles: SpringPackets
+    spring_packets: SpringPackets
     padding_offset: int
     diagonal: NDArray[np.float64]
     linear: NDArray[np.float64]
@@ -43,36 +43,37 @@ class HessianPackets(NamedTuple):
             anchor_stiffness: stiffness of inertia and pins (n,) [N/m], infinite at fixed vertices.
         """
         n, part = len(anchor_stiffness), np.where(np.isinf(anchor_stiffness), -1, 0)
-        bundles, _ = SpringPackets.from_springs(springs, np.arange(n), part, 1, n, n + 1)
-        linear = allocate_aligned(LINEAR_STRIDE * len(bundles.weight_offset))
-        return cls(bundles, 4 * (n + 1), bundles.gather_lanes(np.append(anchor_stiffness, 0.0)), linear)
+        packets, _ = SpringPackets.from_springs(springs, np.arange(n), part, 1, n, n + 1)
+        linear = allocate_aligned(LINEAR_STRIDE * len(packets.weight_offset))
+        return cls(packets, 4 * (n + 1), packets.gather_lanes(np.append(anchor_stiffness, 0.0)), linear)
 
 
 @jit_inner
-def fill_linear_springs(packets, linear):
+def fill_linear_springs(hessian, linear):
     """Write the linearised springs to the entries.
 
     Args:
-        packets: the packets, whose linearised springs are overwritten.
+        hessian: the Hessian in packets, whose linearised springs are overwritten.
         linear: the springs as `linearise_springs` writes them (m, 4).
     """
-    bundles = packets.bundles
-    for e in range(len(bundles.spring_index)):
-        if bundles.neighbour_offset[e] != packets.padding_offset:
-            spring, at = bundles.spring_index[e], LINEAR_STRIDE * (e // LANES) + e % LANES
+    packets = hessian.spring_packets
+    for e in range(len(packets.spring_index)):
+        if packets.neighbour_offset[e] != hessian.padding_offset:
+            spring, at = packets.spring_index[e], LINEAR_STRIDE * (e // LANES) + e % LANES
             spring = max(spring, ~spring)
             for k in range(4):
-                packets.linear[at + LANES * k] = linear[spring, k]
+                hessian.linear[at + LANES * k] = linear[spring, k]
 
 
 @jit_inner
-def multiply_packets(packets, x, out):
+def multiply_packets(hessian, x, out):
     """Write the product of the Hessian with x.
 
     Args:
-        packets: the packets.
+        hessian: the Hessian in packets.
         x: (n + 2, 4) [m]; the last two rows and the last column are zero.
         out: output in the rows of vertices that move (n + 2, 4) [N].
     """
-    for b in range(len(packets.bundles.packet_start) - 1):
-        write_spring_products(packets.bundles, packets.linear, packets.diagonal, b, x, out)
+    packets = hessian.spring_packets
+    for b in range(len(packets.packet_start) - 1):
+        write_spring_products(packets, hessian.linear, hessian.diagonal, b, x, out)

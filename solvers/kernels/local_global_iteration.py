@@ -95,16 +95,16 @@ def _add_slice(a, b):
 
 
 @jit_inner
-def _forward_block(plan, bundles, block, x, right, p, out):
+def _forward_block(plan, packets, block, x, right, p, out):
     """Do the local step of a block and its forward substitution.
 
     The positions are x, or p if that is given.
     """
-    _, _, bundle, bundle_end, chunk, chunk_end, _ = plan.block_table[block]
+    _, _, packet, packet_end, chunk, chunk_end, _ = plan.block_table[block]
     if p is None:
-        add_projection(bundles, bundle, bundle_end, x, right, out, plan.row_shift)
+        add_projection(packets, packet, packet_end, x, right, out, plan.row_shift)
     else:
-        add_descent(bundles, bundle, bundle_end, p, right, out, plan.row_shift)
+        add_descent(packets, packet, packet_end, p, right, out, plan.row_shift)
     forward_substitution(plan.panels, plan.row_slots, plan.chunks, chunk, chunk_end, out)
 
 
@@ -124,7 +124,7 @@ def _clear_block(plan, block, out):
 
 
 @jit_inner
-def _process_group(plan, bundles, group, x, right, p, out, down, up):
+def _process_group(plan, packets, group, x, right, p, out, down, up):
     """Process a group in the order of its visits.
 
     Back substitution changes x; the local step and forward substitution change `out`.
@@ -144,11 +144,11 @@ def _process_group(plan, bundles, group, x, right, p, out, down, up):
             if up:
                 _clear_block(plan, block, out)
         elif up:
-            _forward_block(plan, bundles, block, x, right, p, out)
+            _forward_block(plan, packets, block, x, right, p, out)
 
 
 @jit_inner
-def _process_top(plan, bundles, x, right, p, out):
+def _process_top(plan, packets, x, right, p, out):
     """Process the top: up at the positions x, and down again."""
     top, top_end, groups = plan.top_range
     size = 4 * (top_end - top)
@@ -159,7 +159,7 @@ def _process_top(plan, bundles, x, right, p, out):
         else:
             _add_slice(out[begin : begin + size], out[4 * top : 4 * top_end])
     for block in range(plan.group_blocks[-2], plan.group_blocks[-1]):
-        _forward_block(plan, bundles, block, x, right, p, out)
+        _forward_block(plan, packets, block, x, right, p, out)
         _backward_block(plan, block, out, p)
 
 
@@ -204,12 +204,12 @@ def compute_residual(plan, form, x, before, p, e):
 
 
 @jit_kernel
-def run_blocked_local_step(plan, bundles, x, right, p, out):
+def run_blocked_local_step(plan, packets, x, right, p, out):
     """Do the local step of all blocks without a solve.
 
     Args:
         plan: the plan, for the shift of its rows.
-        bundles: packets of the springs and edges.
+        packets: packets of the springs and edges.
         x: positions in rows of four [m]; not used if p is given.
         right: constant right-hand side (`SpringPackets.build_right_hand_side`).
         p: positions to correct, for which minus the gradient is computed, or None.
@@ -218,13 +218,13 @@ def run_blocked_local_step(plan, bundles, x, right, p, out):
     for k in range(len(out)):
         out[k] = 0.0
     if p is None:
-        add_projection(bundles, 0, len(bundles.packet_start) - 1, x, right, out, plan.row_shift)
+        add_projection(packets, 0, len(packets.packet_start) - 1, x, right, out, plan.row_shift)
     else:
-        add_descent(bundles, 0, len(bundles.packet_start) - 1, p, right, out, plan.row_shift)
+        add_descent(packets, 0, len(packets.packet_start) - 1, p, right, out, plan.row_shift)
 
 
 @jit_inner
-def _run_thread(plan, bundles, form, vectors, right, p, limits, team, first):
+def _run_thread(plan, packets, form, vectors, right, p, limits, team, first):
     """Do the iterations of the groups, from `first` on, that no other thread has claimed.
 
     Phase 2 k is iteration k, phase 2 k + 1 computes its residual if it is requested.
@@ -245,7 +245,7 @@ def _run_thread(plan, bundles, form, vectors, right, p, limits, team, first):
                     _compute_displacement(plan, group, a, c, p, e)
                     team.task_sums[group] = _squared_norm(plan, form, group, e)
                 else:
-                    _process_group(plan, bundles, group, a, right, p, b, k > 0, k < limits.max_iterations)
+                    _process_group(plan, packets, group, a, right, p, b, k > 0, k < limits.max_iterations)
                 if complete_task(team):
                     enough = k == limits.max_iterations
                     if measures:
@@ -264,27 +264,27 @@ def _run_thread(plan, bundles, form, vectors, right, p, limits, team, first):
                         team.results[0] = k
                         finish_phases(team)
                     else:
-                        _process_top(plan, bundles, a, right, p, b)
+                        _process_top(plan, packets, a, right, p, b)
                         release_phase(team, 2 * k + 2)
         phase = wait_for_phase(team, phase)
 
 
 @jit_inner_parallel
-def _run_threads(plan, bundles, form, vectors, right, p, limits, team, threads):
+def _run_threads(plan, packets, form, vectors, right, p, limits, team, threads):
     for thread in prange(threads):
         first = thread * plan.top_range[2] // threads
-        call_in_thread(team, _run_thread, (plan, bundles, form, vectors, right, p, limits, team, first))
+        call_in_thread(team, _run_thread, (plan, packets, form, vectors, right, p, limits, team, first))
 
 
 @jit_kernel
-def run_iterations(plan, bundles, form, vectors, right, p, limits, threads, team):
+def run_iterations(plan, packets, form, vectors, right, p, limits, threads, team):
     """Iterate from the positions in the first vector, or from p if that is given.
 
     p is overwritten.
 
     Args:
         plan: the plan.
-        bundles: packets of the springs and edges.
+        packets: packets of the springs and edges.
         form: packets of |e|_Q^2, with pairs for all energies that are not springs.
         vectors: three vectors that rotate, and one for scratch, of float64.
         right: constant right-hand side (`SpringPackets.build_right_hand_side`).
@@ -300,9 +300,9 @@ def run_iterations(plan, bundles, form, vectors, right, p, limits, threads, team
     reset_team(team)
     team.results[1] = np.nan
     if threads is None:
-        _run_thread(plan, bundles, form, vectors, right, p, limits, team, 0)
+        _run_thread(plan, packets, form, vectors, right, p, limits, team, 0)
     else:
-        _run_threads(plan, bundles, form, vectors, right, p, limits, team, threads)
+        _run_threads(plan, packets, form, vectors, right, p, limits, team, threads)
         raise_thread_error(team)
     x0, x1, x2, _ = vectors
     done = int(team.results[0])

@@ -167,11 +167,11 @@ class SpringPackets(NamedTuple):
 
 
 @jit_inner
-def add_projection(bundles, begin, end, p, right, out, shift):
+def add_projection(packets, begin, end, p, right, out, shift):
     """Add y + A'K d(p) of some packets.
 
     Args:
-        bundles: packets of the springs and edges.
+        packets: packets of the springs and edges.
         begin, end: range of the packets.
         p: positions in rows of four [m].
         right: right-hand side of the packets, with y.
@@ -180,16 +180,16 @@ def add_projection(bundles, begin, end, p, right, out, shift):
     """
     moved = out[4 * shift :]
     for b in range(begin, end):
-        if vectors.add_spring_projection(bundles, b, p, right, moved):
-            add_degenerate_packet(bundles, b, p, right, moved, False)
+        if vectors.add_spring_projection(packets, b, p, right, moved):
+            add_degenerate_packet(packets, b, p, right, moved, False)
 
 
 @jit_inner
-def add_descent(bundles, begin, end, p, right, out, shift):
+def add_descent(packets, begin, end, p, right, out, shift):
     """Add minus the gradient, y - Q p + A'K d(p), of some packets.
 
     Args:
-        bundles: packets of the springs and edges.
+        packets: packets of the springs and edges.
         begin, end: range of the packets.
         p: positions in rows of four [m].
         right: right-hand side of the packets, with y and anchor stiffness.
@@ -198,25 +198,25 @@ def add_descent(bundles, begin, end, p, right, out, shift):
     """
     moved = out[4 * shift :]
     for b in range(begin, end):
-        if vectors.add_spring_forces(bundles, b, p, right, moved):
-            add_degenerate_packet(bundles, b, p, right, moved, True)
+        if vectors.add_spring_forces(packets, b, p, right, moved):
+            add_degenerate_packet(packets, b, p, right, moved, True)
 
 
 @jit_inner
-def add_degenerate_packet(bundles, b, p, right, out, correct):
+def add_degenerate_packet(packets, b, p, right, out, correct):
     """Add the sums of a packet with a spring of zero length.
 
     Args:
-        bundles: packets of the springs and edges.
+        packets: packets of the springs and edges.
         b: index of the packet.
         p: positions in rows of four [m].
         right: right-hand side of the packets.
         out: rows of four [N], updated.
         correct: whether to add minus the gradient, as `add_descent`; if not, as `add_projection`.
     """
-    add_scalar_springs(bundles, b, p, out, correct)
+    add_scalar_springs(packets, b, p, out, correct)
     for lane in range(LANES):
-        i, at = bundles.row_offset[LANES * b + lane], RHS_STRIDE * b + lane
+        i, at = packets.row_offset[LANES * b + lane], RHS_STRIDE * b + lane
         for c in range(3):
             out[i + c] += right[at + LANES * c]
             if correct:
@@ -224,75 +224,75 @@ def add_degenerate_packet(bundles, b, p, right, out, correct):
 
 
 @jit_inner
-def add_scalar_springs(bundles, b, p, out, correct):
+def add_scalar_springs(packets, b, p, out, correct):
     """Add a packet's springs and their edges one by one.
 
     A spring of zero length has the direction of its rest shape.
 
     Args:
-        bundles: packets of the springs and edges.
+        packets: packets of the springs and edges.
         b: index of the packet.
         p: positions in rows of four [m].
         out: rows of four [N], updated.
         correct: whether to add minus the gradient; A'K d is added if not.
     """
     for lane in range(LANES):
-        i = bundles.row_offset[LANES * b + lane]
+        i = packets.row_offset[LANES * b + lane]
         s0 = s1 = s2 = 0.0
-        for entry in range(bundles.packet_start[b], bundles.packet_start[b + 1]):
-            e, w = LANES * entry + lane, bundles.weight_offset[entry] + lane
-            j = bundles.neighbour_offset[e]
+        for entry in range(packets.packet_start[b], packets.packet_start[b + 1]):
+            e, w = LANES * entry + lane, packets.weight_offset[entry] + lane
+            j = packets.neighbour_offset[e]
             v0, v1, v2 = p[i] - p[j], p[i + 1] - p[j + 1], p[i + 2] - p[j + 2]
             if correct:
-                k = bundles.weights[w + LANES]
+                k = packets.weights[w + LANES]
                 s0, s1, s2 = s0 - k * v0, s1 - k * v1, s2 - k * v2
-            scale, squared = bundles.weights[w], v0 * v0 + v1 * v1 + v2 * v2
+            scale, squared = packets.weights[w], v0 * v0 + v1 * v1 + v2 * v2
             if squared <= ZERO_LENGTH_SQUARED:
-                name = bundles.spring_index[e]
+                name = packets.spring_index[e]
                 if name < 0:
                     scale, name = -scale, ~name
-                v0, v1, v2 = bundles.rest_direction[name]
+                v0, v1, v2 = packets.rest_direction[name]
             else:
                 scale /= np.sqrt(squared)
             s0, s1, s2 = s0 + scale * v0, s1 + scale * v1, s2 + scale * v2
-            s0, s1, s2 = _add_edges(bundles, bundles.edges, i, entry, lane, p, correct, (s0, s1, s2))
+            s0, s1, s2 = _add_edges(packets, packets.edges, i, entry, lane, p, correct, (s0, s1, s2))
         out[i], out[i + 1], out[i + 2] = out[i] + s0, out[i + 1] + s1, out[i + 2] + s2
 
 
 @jit_inner
-def _add_edges(bundles, edges, i, entry, lane, p, correct, force):
+def _add_edges(packets, edges, i, entry, lane, p, correct, force):
     """Add an entry's edges, if any, to the force on the vertex at offset i."""
     if edges is None:
         return force
     e = LANES * entry + lane
-    j = bundles.neighbour_offset[e]
+    j = packets.neighbour_offset[e]
     v = p[i] - p[j], p[i + 1] - p[j + 1], p[i + 2] - p[j + 2]
-    n0, n1, n2, _ = unit_direction(v[0], v[1], v[2], bundles.rest_direction, bundles.spring_index[e])
+    n0, n1, n2, _ = unit_direction(v[0], v[1], v[2], packets.rest_direction, packets.spring_index[e])
     return add_edge_forces(edges, entry, lane, v, (n0, n1, n2), correct, force)
 
 
 @jit_inner
-def squared_norm(bundles, begin, end, e, measure):
+def squared_norm(packets, begin, end, e, measure):
     """Return |e|_Q^2 [J], with half of each spring at each end.
 
     Args:
-        bundles: packets whose springs have the stiffness of all energies.
+        packets: packets whose springs have the stiffness of all energies.
         begin, end: range of the packets.
         e: displacements in rows of four [m].
         measure: diagonal part of Q in each lane (8 b,) [N/m].
     """
     total = 0.0
     for b in range(begin, end):
-        total += vectors.spring_squared_norm(bundles, b, e, measure)
+        total += vectors.spring_squared_norm(packets, b, e, measure)
     return total
 
 
 @jit_kernel
-def run_local_step(bundles, p, y, x, b, zero, out):
+def run_local_step(packets, p, y, x, b, zero, out):
     """Write y + A'K d(p).
 
     Args:
-        bundles: packets of the springs, whose rows are the vertices.
+        packets: packets of the springs, whose rows are the vertices.
         p: positions (n, 3) [m].
         y: right-hand side (n, 3) [N].
         x: scratch, n + 2 rows of four; the last two, of padding, are not overwritten.
@@ -305,7 +305,7 @@ def run_local_step(bundles, p, y, x, b, zero, out):
         for c in range(3):
             x[4 * i + c] = p[i, c]
             b[4 * i + c] = 0.0
-    add_projection(bundles, 0, len(bundles.packet_start) - 1, x, zero, b, 0)
+    add_projection(packets, 0, len(packets.packet_start) - 1, x, zero, b, 0)
     for i in range(n):
         for c in range(3):
             out[i, c] = y[i, c] + b[4 * i + c]

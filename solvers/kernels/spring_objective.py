@@ -47,35 +47,35 @@ class ObjectiveWeights(NamedTuple):
 
     @classmethod
     def from_packets(
-        cls, bundles: SpringPackets, anchor_stiffness: NDArray[np.float64], pinned: NDArray[np.int64]
+        cls, packets: SpringPackets, anchor_stiffness: NDArray[np.float64], pinned: NDArray[np.int64]
     ) -> ObjectiveWeights:
         """Build the weights of springs in packets.
 
         Args:
-            bundles: packets of the springs and edges.
+            packets: packets of the springs and edges.
             anchor_stiffness: anchor stiffness h of each row [N/m].
             pinned: rows of the exactly pinned vertices.
         """
-        pull, k = bundles.entry_weights()
-        parts = np.where(np.isin(bundles.neighbour_offset, 4 * pinned), 0.5, 0.25)
+        pull, k = packets.entry_weights()
+        parts = np.where(np.isin(packets.neighbour_offset, 4 * pinned), 0.5, 0.25)
         share = np.divide(parts, k, out=np.zeros_like(k), where=k != 0.0)
         inverse = np.divide(0.5, anchor_stiffness, out=np.zeros_like(anchor_stiffness), where=anchor_stiffness > 0.0)
-        massless = np.unique(bundles.row_offset[bundles.gather_lanes(anchor_stiffness) == 0.0])
-        places = np.column_stack([massless, bundles.right_hand_side_offset(len(anchor_stiffness))[massless // 4]])
+        massless = np.unique(packets.row_offset[packets.gather_lanes(anchor_stiffness) == 0.0])
+        places = np.column_stack([massless, packets.right_hand_side_offset(len(anchor_stiffness))[massless // 4]])
         return cls(
             *deduplicate_packets(share),
-            bundles.gather_lanes(inverse),
+            packets.gather_lanes(inverse),
             places.astype(np.int64),
             2.0 * float(share @ pull**2),
         )
 
 
 @jit_inner
-def value_and_descent(bundles, shares, p, right, out):
+def value_and_descent(packets, shares, p, right, out):
     """Write minus the gradient and return the objective [J].
 
     Args:
-        bundles: packets of the springs and edges.
+        packets: packets of the springs and edges.
         shares: weights of the objective.
         p: positions in rows of four [m].
         right: right-hand side of the packets, with y and anchor stiffness.
@@ -85,14 +85,14 @@ def value_and_descent(bundles, shares, p, right, out):
         The objective, up to a constant of the step.
     """
     total = 0.0
-    for b in range(len(bundles.packet_start) - 1):
-        energy = spring_descent.spring_energy_and_descent(bundles, shares, b, p, right, out)
+    for b in range(len(packets.packet_start) - 1):
+        energy = spring_descent.spring_energy_and_descent(packets, shares, b, p, right, out)
         if energy == spring_descent.SHORT_SPRING:
             for lane in range(LANES):
                 for c in range(4):
-                    out[bundles.row_offset[LANES * b + lane] + c] = 0.0
-            add_degenerate_packet(bundles, b, p, right, out, True)
-            energy = _degenerate_packet_energy(bundles, shares, b, p, right)
+                    out[packets.row_offset[LANES * b + lane] + c] = 0.0
+            add_degenerate_packet(packets, b, p, right, out, True)
+            energy = _degenerate_packet_energy(packets, shares, b, p, right)
         total += energy
     for k in range(len(shares.massless_rows)):
         for c in range(3):
@@ -101,24 +101,24 @@ def value_and_descent(bundles, shares, p, right, out):
 
 
 @jit_inner
-def _degenerate_packet_energy(bundles, shares, b, p, right):
+def _degenerate_packet_energy(packets, shares, b, p, right):
     """Return the energy of a packet with a spring of zero length."""
     total = 0.0
     for lane in range(LANES):
-        i, at = bundles.row_offset[LANES * b + lane], RHS_STRIDE * b + lane
+        i, at = packets.row_offset[LANES * b + lane], RHS_STRIDE * b + lane
         for c in range(3):
             away = right[at + LANES * c] - right[at + 3 * LANES] * p[i + c]
             total += shares.inverse_anchor[LANES * b + lane] * away**2
-    for e in range(LANES * bundles.packet_start[b], LANES * bundles.packet_start[b + 1]):
+    for e in range(LANES * packets.packet_start[b], LANES * packets.packet_start[b + 1]):
         entry, lane = divmod(e, LANES)
-        i, j, w = bundles.row_offset[LANES * b + lane], bundles.neighbour_offset[e], bundles.weight_offset[entry] + lane
+        i, j, w = packets.row_offset[LANES * b + lane], packets.neighbour_offset[e], packets.weight_offset[entry] + lane
         squared = 0.0
         for c in range(3):
             squared += (p[i + c] - p[j + c]) ** 2
         length = 0.0 if squared <= ZERO_LENGTH_SQUARED else np.sqrt(squared)
         total += (
             shares.energy_weights[shares.weight_offset[entry] + lane]
-            * (bundles.weights[w] - bundles.weights[w + LANES] * length) ** 2
+            * (packets.weights[w] - packets.weights[w + LANES] * length) ** 2
         )
-        total += edge_energy(bundles.edges, entry, lane, p[i] - p[j], p[i + 1] - p[j + 1], p[i + 2] - p[j + 2])
+        total += edge_energy(packets.edges, entry, lane, p[i] - p[j], p[i + 1] - p[j + 1], p[i + 2] - p[j + 2])
     return total

@@ -145,14 +145,14 @@ def init_vectors(rows, vectors, p, positions, pin_targets):
 
 
 @jit_kernel
-def solve_step(plan, bundles, form, rows, vectors, right, p, step_arrays, limits, threads, team, out):
+def solve_step(plan, packets, form, rows, vectors, right, p, step_arrays, limits, threads, team, out):
     """Solve a whole step and write the positions to `out`.
 
     An iteration gets single arguments, because nested tuples cost 3 % of a small step.
 
     Args:
         plan: the plan.
-        bundles: packets of the springs and edges.
+        packets: packets of the springs and edges.
         form: packets of |e|_Q^2.
         rows: rows of the vertices.
         vectors: vectors of the iterations.
@@ -170,7 +170,7 @@ def solve_step(plan, bundles, form, rows, vectors, right, p, step_arrays, limits
     target, force, pin_targets, guess = step_arrays
     write_right_hand_side(rows, target, force, pin_targets, right)
     init_vectors(rows, vectors, p, guess, pin_targets)
-    count, residual, x = run_iterations(plan, bundles, form, vectors, right, p, limits, threads, team)
+    count, residual, x = run_iterations(plan, packets, form, vectors, right, p, limits, threads, team)
     if p is None:
         read_positions(rows, x, out)
     else:

@@ -26,15 +26,15 @@ SHORT_SPRING = float("-inf")
 """Result in place of an energy. An energy itself may be negative, because forms have pairs of negative stiffness."""
 
 
-def _spring_gradient_code(typingctx: Any, bundles: Any, shares: Any, number: Any, x: Any, right: Any, out: Any) -> Any:
+def _spring_gradient_code(typingctx: Any, packets: Any, shares: Any, number: Any, x: Any, right: Any, out: Any) -> Any:
     """Write a packet's rows of `out` and return its energy.
 
     If a spring is too short, nothing is written and SHORT_SPRING is returned.
     """
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        bundles, shares, number, x, right, out = unpack_arguments(context, builder, signature, args)
-        v, springs = PacketBuilder(context, builder), SpringPacket.from_bundles(builder, bundles, number)
+        packets, shares, number, x, right, out = unpack_arguments(context, builder, signature, args)
+        v, springs = PacketBuilder(context, builder), SpringPacket.from_packets(builder, packets, number)
         centre = v.gather_rows(x, v.load_row_offsets(springs.row_offset, number))
         edges = None if springs.edges is None else EdgeBuilder(v, springs.edges, number)
         sums, shortest = v.allocate_sums(4), cgutils.alloca_once_value(builder, constant_packet(MAX_SQUARED_LENGTH))
@@ -81,7 +81,7 @@ def _spring_gradient_code(typingctx: Any, bundles: Any, shares: Any, number: Any
                 v.store(row, builder.gep(out, [place]))
         return builder.select(short, F64(SHORT_SPRING), v.sum_lanes(builder.load(sums[3])))
 
-    return types.float64(bundles, shares, number, x, right, out), generate
+    return types.float64(packets, shares, number, x, right, out), generate
 
 
 # Numba passes the first argument itself, which type checkers cannot see.

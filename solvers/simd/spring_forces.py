@@ -30,10 +30,10 @@ def _spring_force_code(subtract_position: bool) -> Callable[..., Any]:
     negative gradient; if not, the constant right-hand side and the spring projections are added.
     """
 
-    def declare(typingctx: Any, bundles: Any, number: Any, x: Any, right: Any, out: Any) -> Any:
+    def declare(typingctx: Any, packets: Any, number: Any, x: Any, right: Any, out: Any) -> Any:
         def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-            bundles, number, x, right, out = unpack_arguments(context, builder, signature, args)
-            v, springs = PacketBuilder(context, builder), SpringPacket.from_bundles(builder, bundles, number)
+            packets, number, x, right, out = unpack_arguments(context, builder, signature, args)
+            v, springs = PacketBuilder(context, builder), SpringPacket.from_packets(builder, packets, number)
             places = v.load_row_offsets(springs.row_offset, number)
             centre = v.gather_rows(x, places)
             v.prefetch_ahead(springs, places, right, out)
@@ -48,7 +48,7 @@ def _spring_force_code(subtract_position: bool) -> Callable[..., Any]:
                     v.add_row(builder.gep(out, [place]), row)
             return short
 
-        return types.boolean(bundles, number, x, right, out), generate
+        return types.boolean(packets, number, x, right, out), generate
 
     return declare
 
@@ -121,15 +121,15 @@ def _add_springs_with_edges(
     v.pipeline_entries(springs.first_entry, springs.end_entry, read, add)
 
 
-def _spring_norm_code(typingctx: Any, bundles: Any, number: Any, x: Any, measure: Any) -> Any:
+def _spring_norm_code(typingctx: Any, packets: Any, number: Any, x: Any, measure: Any) -> Any:
     """Return a packet's share of the squared norm of x.
 
     This is half the sum of its springs' terms, plus `measure` times squared positions.
     """
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        bundles, number, x, measure = unpack_arguments(context, builder, signature, args)
-        v, springs = PacketBuilder(context, builder), SpringPacket.from_bundles(builder, bundles, number)
+        packets, number, x, measure = unpack_arguments(context, builder, signature, args)
+        v, springs = PacketBuilder(context, builder), SpringPacket.from_packets(builder, packets, number)
         centre, (total,) = v.gather_rows(x, v.load_row_offsets(springs.row_offset, number)), v.allocate_sums(1)
 
         def read(entry: Any) -> list[Any]:
@@ -145,7 +145,7 @@ def _spring_norm_code(typingctx: Any, bundles: Any, number: Any, x: Any, measure
             v.multiply_add(v.squared_norm(centre), diagonal, builder.fmul(constant_packet(0.5), builder.load(total)))
         )
 
-    return types.float64(bundles, number, x, measure), generate
+    return types.float64(packets, number, x, measure), generate
 
 
 # Numba passes the first argument itself, which type checkers cannot see.

@@ -59,34 +59,34 @@ class SpringPacket(NamedTuple):
     edges: Any
 
     @classmethod
-    def from_bundles(cls, builder: Any, bundles: Any, number: Any) -> SpringPacket:
+    def from_packets(cls, builder: Any, packets: Any, number: Any) -> SpringPacket:
         """Load the packet with a given index.
 
         Args:
             builder: LLVM builder of the code.
-            bundles: pointers to the arrays of all packets, `SpringPackets` as `unpack_arguments` returns it.
+            packets: pointers to the arrays of all packets, `SpringPackets` as `unpack_arguments` returns it.
             number: index of the packet.
         """
-        begin, end = (builder.load(builder.gep(bundles.packet_start, [builder.add(number, I64(k))])) for k in (0, 1))
-        arrays = bundles.row_offset, bundles.neighbour_offset, bundles.weight_offset, bundles.weights
-        return cls(*arrays, number, begin, end, bundles.edges)
+        begin, end = (builder.load(builder.gep(packets.packet_start, [builder.add(number, I64(k))])) for k in (0, 1))
+        arrays = packets.row_offset, packets.neighbour_offset, packets.weight_offset, packets.weights
+        return cls(*arrays, number, begin, end, packets.edges)
 
 
 class PacketBuilder(VectorBuilder):
     """Builder for packets of eight float64, one for each spring that ends at eight vertices."""
 
-    def load_row_offsets(self, indices: Any, bundle: Any) -> list[Any]:
+    def load_row_offsets(self, indices: Any, packet: Any) -> list[Any]:
         """Load the offsets of eight rows.
 
         Args:
             indices: pointer to offsets (int32), eight for each packet or entry.
-            bundle: index of the packet or entry.
+            packet: index of the packet or entry.
 
         Returns:
             Eight int64.
         """
         b = self.builder
-        first = b.mul(bundle, I64(LANES))
+        first = b.mul(packet, I64(LANES))
         return [b.zext(b.load(b.gep(indices, [b.add(first, I64(lane))])), I64) for lane in range(LANES)]
 
     def gather_rows(self, array: Any, places: list[Any]) -> list[Any]:
@@ -253,17 +253,17 @@ class PacketBuilder(VectorBuilder):
         """
         return self.builder.select(self.builder.fcmp_ordered(order, b, a), b, a)
 
-    def load_right_hand_side(self, array: Any, bundle: Any) -> list[Any]:
+    def load_right_hand_side(self, array: Any, packet: Any) -> list[Any]:
         """Load the constant right-hand side of a packet, and the stiffness of its vertices.
 
         Args:
             array: pointer to the right-hand side, eight x, y, z [N] and stiffnesses [N/m] per packet.
-            bundle: index of the packet.
+            packet: index of the packet.
 
         Returns:
             Packets of x, y and z [N], and of stiffnesses [N/m].
         """
-        at = self.builder.gep(array, [self.builder.mul(bundle, I64(RHS_STRIDE))])
+        at = self.builder.gep(array, [self.builder.mul(packet, I64(RHS_STRIDE))])
         return [self.load(self.builder.gep(at, [I64(LANES * k)]), PACKET_TYPE) for k in range(4)]
 
     def prefetch_ahead(self, springs: SpringPacket, places: list[Any], right: Any, out: Any) -> None:

@@ -17,13 +17,13 @@ LINEAR_STRIDE = 4 * LANES
 
 
 def _spring_product_code(
-    typingctx: Any, bundles: Any, linear: Any, diagonal: Any, number: Any, x: Any, out: Any
+    typingctx: Any, packets: Any, linear: Any, diagonal: Any, number: Any, x: Any, out: Any
 ) -> Any:
     """Write a packet's rows of the product."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        bundles, linear, diagonal, number, x, out = unpack_arguments(context, builder, signature, args)
-        v, springs = PacketBuilder(context, builder), SpringPacket.from_bundles(builder, bundles, number)
+        packets, linear, diagonal, number, x, out = unpack_arguments(context, builder, signature, args)
+        v, springs = PacketBuilder(context, builder), SpringPacket.from_packets(builder, packets, number)
         places = v.load_row_offsets(springs.row_offset, number)
         centre, sums = v.gather_rows(x, places), v.allocate_sums(3)
 
@@ -52,7 +52,7 @@ def _spring_product_code(
             v.store(row, builder.gep(out, [place]))
         return context.get_dummy_value()
 
-    return types.void(bundles, linear, diagonal, number, x, out), generate
+    return types.void(packets, linear, diagonal, number, x, out), generate
 
 
 # Numba passes the first argument itself, which type checkers cannot see.

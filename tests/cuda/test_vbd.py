@@ -70,10 +70,10 @@ def on_device(problem: StepProblem, radius: float = 0.999) -> DeviceSolver:
 @radii
 def test_iterates_are_those_of_the_processor(make: Callable[[], StepProblem], radius: float) -> None:
     problem = make()
-    wanted = iterates(VertexBlockDescent(radius), problem, 5)
+    expected = iterates(VertexBlockDescent(radius), problem, 5)
     for precision, close in zip(PRECISIONS, (1e-10, 1e-5 * spacing(problem)), strict=True):
         found = iterates(VertexBlockDescent(radius, device="cuda", precision=precision), problem, 5)
-        np.testing.assert_allclose(found, wanted, rtol=0, atol=close, err_msg=precision)
+        np.testing.assert_allclose(found, expected, rtol=0, atol=close, err_msg=precision)
 
 
 @pytest.mark.parametrize("name", STARTS)
@@ -82,23 +82,23 @@ def test_iterations_descend_from_any_start(name: str) -> None:
     start = STARTS[name](vertex_terms.apply_exact_pins(problem.initial_guess, problem), np.random.default_rng(0))
     problem = replace(problem, initial_guess=vertex_terms.apply_exact_pins(start, problem))
     step = StepObjective(FixedObjective(problem.system), problem)
-    wanted = iterates(VertexBlockDescent(0.0), problem, 5)
+    expected = iterates(VertexBlockDescent(0.0), problem, 5)
     for precision, round_off in zip(PRECISIONS, (1e-13, 1e-6), strict=True):
         found = iterates(VertexBlockDescent(0.0, device="cuda", precision=precision), problem, 5)
         size = abs(step.objective_change(found[-1], problem.initial_guess)[0])
         rises = [step.objective_change(p, q)[0] for p, q in pairwise((problem.initial_guess, *found))]
         assert np.isfinite(rises).all()
         assert max(rises) <= round_off * size, precision
-        # Where a spring has no length the processor takes the eight vertices of a bundle apart, a device the one.
+        # Where a spring has no length the processor takes the eight vertices of a packet apart, a device the one.
         if precision == "float64" and name != "one point":
-            np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-10)
+            np.testing.assert_allclose(found, expected, rtol=0, atol=1e-10)
 
 
 def test_in_single_precision_it_ends_at_the_minimum_in_double() -> None:
     problem = build_random_problem(0, weights=(1e4, np.inf, 1e2))
-    wanted = iterates(VertexBlockDescent(0.0), problem, 60)[-1]
+    expected = iterates(VertexBlockDescent(0.0), problem, 60)[-1]
     found, _ = on_device(problem, 0.0).replay_iterations(problem, 60)
-    np.testing.assert_allclose(found.positions, wanted, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(found.positions, expected, rtol=0, atol=1e-10)
 
 
 def test_bits_do_not_depend_on_observers() -> None:
@@ -130,9 +130,9 @@ def test_solves_that_reuse_memory_end_at_the_same_bits() -> None:
     alone = [on_device(p).replay_iterations(p, 5)[0].positions for p in (one, other)]
     prepared = on_device(one)
     for _ in range(2):
-        for problem, wanted in zip((one, other), alone, strict=True):
-            np.testing.assert_array_equal(prepared.replay_iterations(problem, 5)[0].positions, wanted)
-            np.testing.assert_array_equal(prepared.solve(problem, StopRule(5)).positions, wanted)
+        for problem, expected in zip((one, other), alone, strict=True):
+            np.testing.assert_array_equal(prepared.replay_iterations(problem, 5)[0].positions, expected)
+            np.testing.assert_array_equal(prepared.solve(problem, StopRule(5)).positions, expected)
 
 
 def test_a_residual_may_end_it_after_each_few_iterations() -> None:

@@ -57,12 +57,12 @@ def iterates(prepared, problem: StepProblem, count: int) -> list[Positions]:
 def local(springs: Springs, p: Positions, y: Positions) -> Positions:
     """The local step by the kernel, over all vertices."""
     n = len(p)
-    bundles, _ = SpringPackets.from_springs(springs, np.arange(n), np.zeros(n, np.int64), 1, n, n + 1)
+    packets, _ = SpringPackets.from_springs(springs, np.arange(n), np.zeros(n, np.int64), 1, n, n + 1)
     x, b = (allocate_aligned(4 * (n + 2)) for _ in range(2))
     x[4 * (n + 1)] = 1e100
-    zero = bundles.build_right_hand_side(np.zeros(n + 2))
+    zero = packets.build_right_hand_side(np.zeros(n + 2))
     out = np.empty_like(p)
-    run_local_step(bundles, p, y, x, b, zero, out)
+    run_local_step(packets, p, y, x, b, zero, out)
     return out
 
 
@@ -73,23 +73,23 @@ def test_the_local_step_is_that_of_the_energy(seed, scale):
     _, springs = build_random_network(rng, n, m)
     p, y = scale * rng.normal(size=(n, 3)), rng.normal(size=(n, 3))
     p[rng.random(n) < 0.2] = p[0]  # springs of no length among others
-    wanted = y.copy()
-    springs.add_projection(p, wanted)
+    expected = y.copy()
+    springs.add_projection(p, expected)
     pull = np.bincount(springs.edges.ravel(), np.repeat(springs.stiffness * springs.rest_length, 2), n)
-    assert (np.abs(local(springs, p, y) - wanted) <= ROUND_OFF * (np.abs(y) + pull[:, None])).all()
+    assert (np.abs(local(springs, p, y) - expected) <= ROUND_OFF * (np.abs(y) + pull[:, None])).all()
 
 
 def test_springs_have_their_weights_and_equal_ones_share_them():
     rng = np.random.default_rng(0)
     for springs in (build_random_network(rng, 30, 90)[1], build_cloth(40).all_springs):
         n = int(springs.edges.max()) + 1
-        bundles, _ = SpringPackets.from_springs(springs, np.arange(n), np.zeros(n, np.int64), 1, n, n + 1)
-        pull, k = bundles.entry_weights()
-        used = bundles.neighbour_offset != 4 * (n + 1)
-        name = np.maximum(bundles.spring_index, ~bundles.spring_index)[used]
+        packets, _ = SpringPackets.from_springs(springs, np.arange(n), np.zeros(n, np.int64), 1, n, n + 1)
+        pull, k = packets.entry_weights()
+        used = packets.neighbour_offset != 4 * (n + 1)
+        name = np.maximum(packets.spring_index, ~packets.spring_index)[used]
         np.testing.assert_array_equal(k[used], springs.stiffness[name])
         np.testing.assert_array_equal(pull[used], springs.stiffness[name] * springs.rest_length[name])
-    assert len(bundles.weights) < 0.2 * len(pull)  # a cloth's springs are of two kinds, in a few orders
+    assert len(packets.weights) < 0.2 * len(pull)  # a cloth's springs are of two kinds, in a few orders
 
 
 def test_positions_that_are_not_numbers_stay_so_where_they_are_and_at_their_neighbours():
@@ -144,10 +144,10 @@ problems = pytest.mark.parametrize("name", PROBLEMS)
 @problems
 def test_every_precision_ends_where_float64_ends(solver, name):
     problem = PROBLEMS[name]()
-    wanted = iterates(SparseLocalGlobal().prepare(problem.system), problem, 6000)[-1]
+    expected = iterates(SparseLocalGlobal().prepare(problem.system), problem, 6000)[-1]
     found = solver.prepare(problem.system).solve(problem, StopRule(6000)).positions
     # The tolerance of the method, of a scene of size one; rates of convergence leave less than 1e-11.
-    assert np.abs(found - wanted).max() <= 1e-9
+    assert np.abs(found - expected).max() <= 1e-9
 
 
 @less
@@ -168,9 +168,9 @@ def test_the_energy_never_rises_with_a_rounded_factor(solver, name, start):
 def test_collapsed_positions_come_apart_as_in_the_sparse_backend(solver, name):
     problem = PROBLEMS[name]()
     problem = replace(problem, initial_guess=np.zeros_like(problem.inertial_target))
-    wanted = iterates(SparseLocalGlobal().prepare(problem.system), problem, 1)[0]
+    expected = iterates(SparseLocalGlobal().prepare(problem.system), problem, 1)[0]
     found = iterates(solver.prepare(problem.system), problem, 1)[0]
-    assert np.abs(found - wanted).max() <= 1e-10 * np.abs(wanted).max()  # a solve, by the condition of Q
+    assert np.abs(found - expected).max() <= 1e-10 * np.abs(expected).max()  # a solve, by the condition of Q
 
 
 @pytest.mark.parametrize("solver", DIRECT[3:], ids=format_label)

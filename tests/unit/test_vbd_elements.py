@@ -63,12 +63,12 @@ def test_the_force_on_a_vertex_is_that_of_the_reference_evaluator(effect):
 
     gradient, block, rises, value = (np.empty(shape) for shape in ((n, 3), (n, 6), n, 1))
     jit_kernel(evaluate_vertex)(around, np.pad(p, ((0, 0), (0, 1))).ravel(), d, gradient, block, rises, value)
-    wanted = np.zeros_like(p)
-    energy.add_gradient(p, wanted)
+    expected = np.zeros_like(p)
+    energy.add_gradient(p, expected)
     blocks = energy.hessian(p).toarray().reshape(n, 3, n, 3)[np.arange(n), :, np.arange(n)]
-    assert np.abs(wanted).max() > 0.1
+    assert np.abs(expected).max() > 0.1
     np.testing.assert_allclose(value[0], energy.value(p), rtol=1e-12)
-    np.testing.assert_allclose(gradient, wanted, atol=1e-12 * np.abs(wanted).max())
+    np.testing.assert_allclose(gradient, expected, atol=1e-12 * np.abs(expected).max())
     np.testing.assert_allclose(block, blocks[:, *np.triu_indices(3)], atol=1e-12 * np.abs(blocks).max())
     for i in range(n):
         moved = p.copy()
@@ -87,10 +87,10 @@ def test_no_iteration_raises_the_objective_and_the_end_is_newtons_minimum(method
         path = [p.copy() for p in islice(prepared.iterates(given), 40)]
         for before, after in pairwise(path):
             assert given.value(after) <= given.value(before) + 1e-13 * given.value_scale(before)  # a hundred terms
-    wanted = NewtonSolver().prepare(problem.system).solve(problem, StopRule(100, 1e-12)).positions
-    near = replace(problem, initial_guess=wanted + 1e-3 * NOISE.normal(size=wanted.shape))
+    expected = NewtonSolver().prepare(problem.system).solve(problem, StopRule(100, 1e-12)).positions
+    near = replace(problem, initial_guess=expected + 1e-3 * NOISE.normal(size=expected.shape))
     found = prepared.solve(near, StopRule(4000)).positions
-    np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-9)  # what a linear rate leaves
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9)  # what a linear rate leaves
     assert np.array_equal(found, method.prepare(problem.system).solve(near, StopRule(4000)).positions)
 
 
@@ -107,8 +107,8 @@ def test_vertices_of_one_element_have_different_colours():
     apart = replace(system, energies=(*(e for e in system.energies if e not in damped), *far))
     made = VertexBlockDescent().prepare(apart)
     assert isinstance(made, PreparedVertexBlockDescent)
-    bundle = {int(place) // 4: k // 8 for k, place in enumerate(made.colour_packets.spring_packets.row_offset)}
-    assert all(bundle[int(made.row_of_vertex[i])] != bundle[int(made.row_of_vertex[j])] for i, j in ((0, 35), (5, 30)))
+    packet = {int(place) // 4: k // 8 for k, place in enumerate(made.colour_packets.spring_packets.row_offset)}
+    assert all(packet[int(made.row_of_vertex[i])] != packet[int(made.row_of_vertex[j])] for i, j in ((0, 35), (5, 30)))
 
 
 def test_an_energy_without_a_bound_on_its_curvature_is_refused_with_that_reason():

@@ -104,24 +104,24 @@ def half_space_energy(s, p):
 
 
 @jit_inner
-def _spring_gradient_and_block(bundles, b, lane, p, x, anchor_stiffness, load):
+def _spring_gradient_and_block(packets, b, lane, p, x, anchor_stiffness, load):
     """Return the gradient and the block's upper triangle of a vertex's springs, inertia and pins."""
     g0, g1, g2 = -load[0], -load[1], -load[2]
     a00, a01, a02, a11, a12, a22 = anchor_stiffness, 0.0, 0.0, anchor_stiffness, 0.0, anchor_stiffness
-    for entry in range(bundles.packet_start[b], bundles.packet_start[b + 1]):
-        e, w = LANES * entry + lane, bundles.weight_offset[entry] + lane
-        j, k, pull = bundles.neighbour_offset[e], bundles.weights[w + LANES], bundles.weights[w]
-        if k == 0.0 and bundles.edges is None:
+    for entry in range(packets.packet_start[b], packets.packet_start[b + 1]):
+        e, w = LANES * entry + lane, packets.weight_offset[entry] + lane
+        j, k, pull = packets.neighbour_offset[e], packets.weights[w + LANES], packets.weights[w]
+        if k == 0.0 and packets.edges is None:
             continue
         v0, v1, v2 = x[0] - p[j], x[1] - p[j + 1], x[2] - p[j + 2]
-        n0, n1, n2, length = unit_direction(v0, v1, v2, bundles.rest_direction, bundles.spring_index[e])
+        n0, n1, n2, length = unit_direction(v0, v1, v2, packets.rest_direction, packets.spring_index[e])
         lateral = max(k - pull / length, min(k, 0.0)) if length > 0.0 else 0.0 if pull > 0.0 else k
         tension, axial = k * length - pull, k - lateral
         g0, g1, g2 = g0 + tension * n0, g1 + tension * n1, g2 + tension * n2
         a00, a01, a02 = a00 + axial * n0 * n0 + lateral, a01 + axial * n0 * n1, a02 + axial * n0 * n2
         a11, a12, a22 = a11 + axial * n1 * n1 + lateral, a12 + axial * n1 * n2, a22 + axial * n2 * n2 + lateral
         (g0, g1, g2), (a00, a01, a02, a11, a12, a22) = add_edge_derivatives(
-            bundles.edges, entry, lane, (v0, v1, v2), (n0, n1, n2), length,
+            packets.edges, entry, lane, (v0, v1, v2), (n0, n1, n2), length,
             (g0, g1, g2), (a00, a01, a02, a11, a12, a22),
         )  # fmt: skip
     return (g0, g1, g2), (a00, a01, a02, a11, a12, a22)
@@ -220,7 +220,7 @@ def solve_block(block, g):
 
 
 @jit_inner
-def _energy_change(bundles, b, lane, p, x, d, anchor_stiffness, load):
+def _energy_change(packets, b, lane, p, x, d, anchor_stiffness, load):
     """Return the change of a vertex's energy [J] by a step d, without cancellation.
 
     The energy is that of springs, inertia and pins.
@@ -228,10 +228,10 @@ def _energy_change(bundles, b, lane, p, x, d, anchor_stiffness, load):
     total = 0.0
     for c in range(3):
         total += d[c] * (0.5 * anchor_stiffness * d[c] - load[c])
-    for entry in range(bundles.packet_start[b], bundles.packet_start[b + 1]):
-        j, w = bundles.neighbour_offset[LANES * entry + lane], bundles.weight_offset[entry] + lane
-        stiffness, before, after, change = bundles.weights[w + LANES], 0.0, 0.0, 0.0
-        total += edge_energy_change(bundles.edges, entry, lane, (x[0] - p[j], x[1] - p[j + 1], x[2] - p[j + 2]), d)
+    for entry in range(packets.packet_start[b], packets.packet_start[b + 1]):
+        j, w = packets.neighbour_offset[LANES * entry + lane], packets.weight_offset[entry] + lane
+        stiffness, before, after, change = packets.weights[w + LANES], 0.0, 0.0, 0.0
+        total += edge_energy_change(packets.edges, entry, lane, (x[0] - p[j], x[1] - p[j + 1], x[2] - p[j + 2]), d)
         if stiffness == 0.0:
             continue
         for c in range(3):
@@ -241,7 +241,7 @@ def _energy_change(bundles, b, lane, p, x, d, anchor_stiffness, load):
             change += d[c] * (2.0 * v + d[c])
         both = np.sqrt(before) + np.sqrt(after)
         if both > 0.0:
-            total += change * (0.5 * stiffness - bundles.weights[w] / both)
+            total += change * (0.5 * stiffness - packets.weights[w] / both)
     return total
 
 
@@ -315,24 +315,24 @@ def build_vertex_move(add_gradient_block: Any, energy_change: Any) -> Any:
 
     @jit_closure
     def compute_energy_change(d, where):
-        bundles, elements, b, lane, i, p, x, anchor_stiffness, load = where
-        return _energy_change(bundles, b, lane, p, x, d, anchor_stiffness, load) + energy_change(elements, i, p, d)
+        packets, elements, b, lane, i, p, x, anchor_stiffness, load = where
+        return _energy_change(packets, b, lane, p, x, d, anchor_stiffness, load) + energy_change(elements, i, p, d)
 
     compute_step = build_block_step(compute_energy_change)
 
     @jit_closure
-    def move(bundles, s, elements, b, unknowns, p, right, majorant):
+    def move(packets, s, elements, b, unknowns, p, right, majorant):
         for lane in range(LANES):
-            i = bundles.row_offset[LANES * b + lane] // 4
+            i = packets.row_offset[LANES * b + lane] // 4
             if i >= unknowns:
                 continue
             at, most = RHS_STRIDE * b + lane, majorant[LANES * b + lane]
             h = right[at + 3 * LANES]
             x = p[4 * i], p[4 * i + 1], p[4 * i + 2]
             load = right[at] - h * x[0], right[at + LANES] - h * x[1], right[at + 2 * LANES] - h * x[2]
-            gradient, block = _spring_gradient_and_block(bundles, b, lane, p, x, h, load)
+            gradient, block = _spring_gradient_and_block(packets, b, lane, p, x, h, load)
             gradient, block = add_gradient_block(elements, i, p, gradient, block)
-            majorant_block, where = (most, 0.0, 0.0, most, 0.0, most), (bundles, elements, b, lane, i, p, x, h, load)
+            majorant_block, where = (most, 0.0, 0.0, most, 0.0, most), (packets, elements, b, lane, i, p, x, h, load)
             d = compute_step(s, i, x, majorant_block, EXACT_BLOCK, gradient, block, where)
             p[4 * i], p[4 * i + 1], p[4 * i + 2] = x[0] + d[0], x[1] + d[1], x[2] + d[2]
 

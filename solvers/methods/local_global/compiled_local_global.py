@@ -86,12 +86,12 @@ class CompiledLocalGlobal:
 
 def _compile_local_step(springs: Springs, n: int) -> LocalStep:
     """Compile the local step for a linear solver that is called from Python."""
-    bundles, _ = kernels.SpringPackets.from_springs(springs, np.arange(n), np.zeros(n, np.int64), 1, n, n + 1)
+    packets, _ = kernels.SpringPackets.from_springs(springs, np.arange(n), np.zeros(n, np.int64), 1, n, n + 1)
     x, b = (allocate_aligned(4 * (n + 2)) for _ in range(2))
     x[4 * (n + 1)] = PADDING_COORDINATE
-    zero = bundles.build_right_hand_side(np.zeros(n + 2))
+    zero = packets.build_right_hand_side(np.zeros(n + 2))
 
     def project(p: Positions, y: Positions, out: Positions) -> None:
-        kernels.run_local_step(bundles, p, y, x, b, zero, out)
+        kernels.run_local_step(packets, p, y, x, b, zero, out)
 
     return project

@@ -197,9 +197,9 @@ class PreparedCompiledLocalGlobal(IterativeSolver):
         form, first = kernels.SpringPackets.from_springs(parts.system_pairs, *where)
         # A solve for positions has the forms in Q; one for corrections also needs their gradient.
         local = parts.joined_pairs if corrects else parts.springs
-        bundles = form
+        packets = form
         if local is not parts.system_pairs:
-            bundles, _ = kernels.SpringPackets.from_springs(local, *where, parts.attach_edges(local))
+            packets, _ = kernels.SpringPackets.from_springs(local, *where, parts.attach_edges(local))
         inertia = s.inertia_diagonal
         anchor_stiffness, measure, loose = np.zeros((3, padding_row + 2 + order.row_shift))
         anchor_stiffness[row] = measure[row] = inertia + parts.vertex_weight
@@ -211,9 +211,9 @@ class PreparedCompiledLocalGlobal(IterativeSolver):
             base,
             parts,
             _build_plan(order, first, anchor_stiffness, form.gather_lanes(measure), loose),
-            bundles,
+            packets,
             form,
-            _build_vertex_rows(base, row, bundles.right_hand_side_offset(len(anchor_stiffness))[row], corrects),
+            _build_vertex_rows(base, row, packets.right_hand_side_offset(len(anchor_stiffness))[row], corrects),
             padding_row + 1,
             corrects,
             np.inf if corrects else _max_direct_coordinate(base, parts.springs),
@@ -283,10 +283,10 @@ class PreparedCompiledLocalGlobal(IterativeSolver):
         target, force, pins, guess = self.step_arrays(problem, problem.initial_guess)
         step_setup.write_right_hand_side(self.vertex_rows, target, force, pins, right)
         step_setup.init_vectors(self.vertex_rows, work.vectors, p, guess, pins)
-        bundles = self.spring_form.update_edges(self.spring_packets.with_own_dashpots(), problem)
+        packets = self.spring_form.update_edges(self.spring_packets.with_own_dashpots(), problem)
 
         def local() -> NDArray[Any]:
-            local_global_iteration.run_blocked_local_step(self.iteration_plan, bundles, a, right, p, b)
+            local_global_iteration.run_blocked_local_step(self.iteration_plan, packets, a, right, p, b)
             return b
 
         y, out = self.base.system.inertia_diagonal[:, None] * target + force, np.zeros_like(target)

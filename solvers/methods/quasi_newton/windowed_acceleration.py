@@ -193,12 +193,12 @@ class CompiledEngine:
     def __init__(self, scheme: AccelerationScheme, compiled: PreparedCompiledLocalGlobal) -> None:
         self._acceleration_scheme = scheme
         self.spring_form, self._form = compiled.spring_form, compiled.norm_packets
-        plan, bundles, self._rows = compiled.iteration_plan, compiled.spring_packets, compiled.vertex_rows
+        plan, packets, self._rows = compiled.iteration_plan, compiled.spring_packets, compiled.vertex_rows
         pins = compiled.base.system.pins
         self._block_entries = 4 * int(plan.block_table[:, 1].max())
-        self._plan, self._spring_packets, self._padding_row = plan, bundles, compiled.padding_row
+        self._plan, self._spring_packets, self._padding_row = plan, packets, compiled.padding_row
         self._shares = ObjectiveWeights.from_packets(
-            bundles, plan.anchor_stiffness, self._rows.row_of_vertex[pins.vertices[pins.exact_mask]]
+            packets, plan.anchor_stiffness, self._rows.row_of_vertex[pins.vertices[pins.exact_mask]]
         )
         self.has_energy_scales = bool(self.spring_form.form_builders) or self.spring_form.has_edges
         self.free_memory: list[AccelerationMemory] = []

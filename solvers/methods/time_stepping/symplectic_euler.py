@@ -86,8 +86,8 @@ class SymplecticEuler:
         taken = f"; {soft} pins by penalty taken as exact" if soft else ""
         choice = f"{needed:.0f} substeps for vibrations of at most {omega:.3g} rad/s{taken}"
         part = np.where(system.unpinned_mask, 0, -1)
-        bundles, _ = SpringPackets.from_springs(springs, np.arange(n), part, 1, n, n + 1)
-        return PreparedSymplecticEuler(system, bundles, int(needed), choice)
+        packets, _ = SpringPackets.from_springs(springs, np.arange(n), part, 1, n, n + 1)
+        return PreparedSymplecticEuler(system, packets, int(needed), choice)
 
 
 def bound_max_frequency(system: System, springs: Springs) -> float:
@@ -167,13 +167,13 @@ class PreparedSymplecticEuler(IterativeSolver):
 
 
 @jit_kernel
-def run_symplectic_euler(bundles, pins, begin, end, force, rate, h, count, p, v, acceleration):
+def run_symplectic_euler(packets, pins, begin, end, force, rate, h, count, p, v, acceleration):
     """Run `count` substeps of size h, with the springs in packets of eight vertices.
 
     The arrays p and v, in rows of four, are overwritten with the result.
 
     Args:
-        bundles: packets of the springs.
+        packets: packets of the springs.
         pins: vertices (q,) that move uniformly from `begin` to `end`.
         begin, end: positions of the pins (q, 3) [m].
         force: force [N] in the layout of the packets' right-hand side, with zero anchor stiffness.
@@ -187,7 +187,7 @@ def run_symplectic_euler(bundles, pins, begin, end, force, rate, h, count, p, v,
     for step in range(1, count + 1):
         for k in range(len(acceleration)):
             acceleration[k] = 0.0
-        add_descent(bundles, 0, len(bundles.packet_start) - 1, p, force, acceleration, 0)
+        add_descent(packets, 0, len(packets.packet_start) - 1, p, force, acceleration, 0)
         for i in range(len(rate)):
             for k in range(4 * i, 4 * i + 3):
                 v[k] += rate[i] * acceleration[k]

@@ -64,7 +64,7 @@ class VertexBlocks(NamedTuple):
         row[order], row[pinned] = np.arange(len(order)), np.arange(len(order), n)
         colour[pinned] = -1
         packed = parts.select_packed_edges()
-        bundles, first = SpringPackets.from_springs(
+        packets, first = SpringPackets.from_springs(
             parts.springs_and_forms,
             row,
             colour,
@@ -80,6 +80,6 @@ class VertexBlocks(NamedTuple):
         majorant[: len(order)] += vertex_elements.stiffness_diagonal()[order]
         for energy in (*packed.strain_limits, *packed.dashpots):
             majorant[: len(order)] += energy.stiffness_matrix(n).diagonal()[order]
-        ends = np.repeat(bundles.row_offset.reshape(-1, LANES), np.diff(bundles.packet_start), axis=0)
-        np.add.at(majorant, ends.ravel() // 4, bundles.entry_weights()[1])
-        return cls(row, len(order), bundles, first, anchor_stiffness, majorant)
+        ends = np.repeat(packets.row_offset.reshape(-1, LANES), np.diff(packets.packet_start), axis=0)
+        np.add.at(majorant, ends.ravel() // 4, packets.entry_weights()[1])
+        return cls(row, len(order), packets, first, anchor_stiffness, majorant)

@@ -44,17 +44,17 @@ def build_element_iteration(*kinds: ElementKind) -> Any:
     @jit_closure
     def sweep(blocks, spaces, elements, right, p, work):
         """Move every vertex once to a lower energy."""
-        bundles, sums = blocks.spring_packets, work.packet_sums
-        for b in range(len(bundles.packet_start) - 1):
+        packets, sums = blocks.spring_packets, work.packet_sums
+        for b in range(len(packets.packet_start) - 1):
             if spaces is not None:  # noqa: SIM102 Numba leaves a branch out for None alone
                 if spaces.has_half_space[b]:
-                    move(bundles, spaces, elements, b, blocks.num_free, p, right, blocks.majorant)
+                    move(packets, spaces, elements, b, blocks.num_free, p, right, blocks.majorant)
                     continue
-            if vbd_vertex_model(bundles, b, p, right, work.spring_scratch, sums):
+            if vbd_vertex_model(packets, b, p, right, work.spring_scratch, sums):
                 without_length(blocks, elements, right, b, p, work)
                 continue
             for lane in range(LANES):
-                i = bundles.row_offset[LANES * b + lane] // 4
+                i = packets.row_offset[LANES * b + lane] // 4
                 if i < blocks.num_free:
                     force = -sums[lane], -sums[LANES + lane], -sums[2 * LANES + lane]
                     block = (
@@ -66,9 +66,9 @@ def build_element_iteration(*kinds: ElementKind) -> Any:
                         sums[LANES * c + lane] = -gradient[c]
                     for k in range(6):
                         sums[LANES * (3 + k) + lane] = block[k]
-            vbd_model_step(bundles, b, p, right, work.spring_scratch, sums)
+            vbd_model_step(packets, b, p, right, work.spring_scratch, sums)
             for lane in range(LANES):
-                i = bundles.row_offset[LANES * b + lane] // 4
+                i = packets.row_offset[LANES * b + lane] // 4
                 if i >= blocks.num_free:
                     continue
                 d = (

@@ -205,12 +205,12 @@ def build_offset_sweeps(*kinds: ElementKind) -> Any:
     @jit_closure
     def move_packet(blocks, elements, contacts, right, b, p, work):
         """Move the vertices of a packet by Newton steps, or by those of a majorant."""
-        bundles, sums = blocks.spring_packets, work.packet_sums
-        short = vbd_vertex_model(bundles, b, p, right, work.spring_scratch, sums)
+        packets, sums = blocks.spring_packets, work.packet_sums
+        short = vbd_vertex_model(packets, b, p, right, work.spring_scratch, sums)
         if short:
-            write_degenerate_descent(bundles, b, p, right, work.descent_scratch)
+            write_degenerate_descent(packets, b, p, right, work.descent_scratch)
         for lane in range(LANES):
-            at = bundles.row_offset[LANES * b + lane]
+            at = packets.row_offset[LANES * b + lane]
             i = at // 4
             if i >= blocks.num_free:
                 continue
@@ -250,18 +250,18 @@ def build_offset_sweeps(*kinds: ElementKind) -> Any:
         Returns:
             Number of sweeps, and number of vertices that the last one truncated.
         """
-        bundles, truncated = blocks.spring_packets, 0
+        packets, truncated = blocks.spring_packets, 0
         for count in range(iterations):
             truncated = 0
-            for b in range(len(bundles.packet_start) - 1):
+            for b in range(len(packets.packet_start) - 1):
                 if (
                     has_elements
                     or contacts.has_contact[b]
-                    or vbd_newton_step(bundles, b, p, right, blocks.majorant, work.spring_scratch)
+                    or vbd_newton_step(packets, b, p, right, blocks.majorant, work.spring_scratch)
                 ):
                     move_packet(blocks, elements, contacts, right, b, p, work)
                 for lane in range(LANES):
-                    i = bundles.row_offset[LANES * b + lane] // 4
+                    i = packets.row_offset[LANES * b + lane] // 4
                     if i < blocks.num_free:
                         truncated += truncate_row(contacts, i, p)
             if truncated > max_truncated:

@@ -158,15 +158,15 @@ def _load_vertices(
     return places, centre, [v.subtract_product(c, weight, p) for c, p in zip(constants, centre, strict=True)], weight
 
 
-def _newton_step_code(typingctx: Any, bundles: Any, number: Any, x: Any, right: Any, majorant: Any, near: Any) -> Any:
+def _newton_step_code(typingctx: Any, packets: Any, number: Any, x: Any, right: Any, majorant: Any, near: Any) -> Any:
     """Move a packet's vertices in x; return whether a spring is too short.
 
     If one is, no vertex is moved.
     """
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        bundles, number, x, right, majorant, near = unpack_arguments(context, builder, signature, args)
-        v, springs = PacketBuilder(context, builder), SpringPacket.from_bundles(builder, bundles, number)
+        packets, number, x, right, majorant, near = unpack_arguments(context, builder, signature, args)
+        v, springs = PacketBuilder(context, builder), SpringPacket.from_packets(builder, packets, number)
         places, centre, load, weight = _load_vertices(v, springs, number, x, right)
         force, block, short = _build_vertex_model(v, springs, near, x, centre, load, weight)
         d, definite = _solve_newton_system(v, block, [builder.fsub(_ZERO, component) for component in force])
@@ -180,28 +180,28 @@ def _newton_step_code(typingctx: Any, bundles: Any, number: Any, x: Any, right: 
                 v.store(row, builder.gep(x, [place]))
         return short
 
-    return types.boolean(bundles, number, x, right, majorant, near), generate
+    return types.boolean(packets, number, x, right, majorant, near), generate
 
 
-def _vertex_model_code(typingctx: Any, bundles: Any, number: Any, x: Any, right: Any, near: Any, sums: Any) -> Any:
+def _vertex_model_code(typingctx: Any, packets: Any, number: Any, x: Any, right: Any, near: Any, sums: Any) -> Any:
     """Write a packet's negative gradients (3) and blocks (6) to `sums`, eight numbers each.
 
     Returns whether a spring is too short.
     """
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        bundles, number, x, right, near, sums = unpack_arguments(context, builder, signature, args)
-        v, springs = PacketBuilder(context, builder), SpringPacket.from_bundles(builder, bundles, number)
+        packets, number, x, right, near, sums = unpack_arguments(context, builder, signature, args)
+        v, springs = PacketBuilder(context, builder), SpringPacket.from_packets(builder, packets, number)
         _, centre, load, weight = _load_vertices(v, springs, number, x, right)
         force, block, short = _build_vertex_model(v, springs, near, x, centre, load, weight)
         for k, value in enumerate([*force, *block]):
             v.store(value, builder.gep(sums, [I64(LANES * k)]))
         return short
 
-    return types.boolean(bundles, number, x, right, near, sums), generate
+    return types.boolean(packets, number, x, right, near, sums), generate
 
 
-def _model_step_code(typingctx: Any, bundles: Any, number: Any, x: Any, right: Any, near: Any, sums: Any) -> Any:
+def _model_step_code(typingctx: Any, packets: Any, number: Any, x: Any, right: Any, near: Any, sums: Any) -> Any:
     """Write the Newton steps (3) of the model in `sums`, and their energy changes.
 
     They follow the gradients, in place of the blocks. The changes are those of all energies in the vertex model, and
@@ -209,8 +209,8 @@ def _model_step_code(typingctx: Any, bundles: Any, number: Any, x: Any, right: A
     """
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        bundles, number, x, right, near, sums = unpack_arguments(context, builder, signature, args)
-        v, springs = PacketBuilder(context, builder), SpringPacket.from_bundles(builder, bundles, number)
+        packets, number, x, right, near, sums = unpack_arguments(context, builder, signature, args)
+        v, springs = PacketBuilder(context, builder), SpringPacket.from_packets(builder, packets, number)
         _, _, load, weight = _load_vertices(v, springs, number, x, right)
         at = [builder.gep(sums, [I64(LANES * k)]) for k in range(9)]
         loaded = [v.load(pointer, PACKET_TYPE) for pointer in at]
@@ -222,7 +222,7 @@ def _model_step_code(typingctx: Any, bundles: Any, number: Any, x: Any, right: A
             v.store(value, pointer)
         return context.get_dummy_value()
 
-    return types.void(bundles, number, x, right, near, sums), generate
+    return types.void(packets, number, x, right, near, sums), generate
 
 
 # Numba passes the first argument itself, which type checkers cannot see.

@@ -124,11 +124,11 @@ def _sweep_vertices(blocks, spaces, elements, right, p, work):
 
 
 @jit_inner
-def write_degenerate_descent(bundles, b, p, right, out):
+def write_degenerate_descent(packets, b, p, right, out):
     """Write minus the gradient of a packet with a spring of zero length to `out`.
 
     Args:
-        bundles: packets of the springs.
+        packets: packets of the springs.
         b: index of the packet.
         p: positions in rows of four [m].
         right: constant right-hand side [N] by packets, with anchor stiffnesses [N/m].
@@ -136,8 +136,8 @@ def write_degenerate_descent(bundles, b, p, right, out):
     """
     for lane in range(LANES):
         for k in range(4):
-            out[bundles.row_offset[LANES * b + lane] + k] = 0.0
-    add_degenerate_packet(bundles, b, p, right, out, True)
+            out[packets.row_offset[LANES * b + lane] + k] = 0.0
+    add_degenerate_packet(packets, b, p, right, out, True)
 
 
 @jit_inner
