@@ -85,8 +85,8 @@ class Call(NamedTuple):
 
 def row(module: str) -> int:
     _, package, name, *_ = [*module.split("."), ""]
-    wanted = package if package == "solvers" else name
-    return next(index for index, names in enumerate(ROWS) if wanted in names.split())
+    expected = package if package == "solvers" else name
+    return next(index for index, names in enumerate(ROWS) if expected in names.split())
 
 
 def carries_specification(value: object, depth: int = 3) -> bool:

@@ -437,7 +437,7 @@ IN_PROCESS = {
 
 def print_medians(measurements: Sequence[Mapping[str, Any]]) -> None:
     """Print the medians of each row."""
-    table = Table("row", "cold", "wanted", "value", "wall s", "processor s", "first output s")
+    table = Table("row", "cold", "target", "value", "wall s", "processor s", "first output s")
     for name in dict.fromkeys(one["row"] for one in measurements):
         some = [one for one in measurements if one["row"] == name]
         middle = {key: median(one[key] for one in some) for key in _NUMBERS}

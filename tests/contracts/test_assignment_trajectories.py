@@ -104,9 +104,9 @@ def test_a_scene_moves_as_the_assignment_moves_it(name, backend, tmp_path):
     spec = load_scene(write_scene(tmp_path, name))
     made = build_scene(spec, 0)
     found = simulate_trajectory(made, backend, FRAMES, initial_guess=spec.initial_guess)
-    wanted = assignment(*SCENES[name])
-    assert np.abs(found - wanted).max() <= AGREEMENT * made.mesh.bounding_box_diagonal
-    assert np.abs(wanted - wanted[0]).max() > 0.01 * made.mesh.bounding_box_diagonal  # it does move
+    expected = assignment(*SCENES[name])
+    assert np.abs(found - expected).max() <= AGREEMENT * made.mesh.bounding_box_diagonal
+    assert np.abs(expected - expected[0]).max() > 0.01 * made.mesh.bounding_box_diagonal  # it does move
 
 
 @pytest.mark.parametrize("name", SCENES)

@@ -160,5 +160,5 @@ def test_the_dense_backend_is_the_formulas_of_the_paper():
     d = (r / np.where(length, length, 1.0))[:, None] * v
     Q = A.T @ K @ A + M / dt**2 + w * C.T @ C
     y = M @ problem.inertial_target / dt**2 + problem.external_force + w * C.T @ problem.pin_targets
-    wanted = np.linalg.solve(Q, A.T @ K @ d + y)
-    np.testing.assert_allclose(after_iterations(DenseLocalGlobal(), problem, 1), wanted, rtol=0, atol=AGREEMENT)
+    expected = np.linalg.solve(Q, A.T @ K @ d + y)
+    np.testing.assert_allclose(after_iterations(DenseLocalGlobal(), problem, 1), expected, rtol=0, atol=AGREEMENT)

@@ -53,10 +53,10 @@ def find_contact_step(scene: str) -> tuple[StepProblem, Positions]:
 @pytest.mark.parametrize("scene", SCENES)
 @pytest.mark.parametrize("solver", TAKE)
 def test_solvers_agree_at_convergence(solver, scene):
-    problem, wanted = find_contact_step(scene)
+    problem, expected = find_contact_step(scene)
     found = SOLVER_INSTANCES[solver].prepare(problem.system).solve(problem, StopRule(1500, 1e-9))
     # Local-global converges linearly: what is left is some hundred times the last step, 1e-9 of the first.
-    np.testing.assert_allclose(found.positions, wanted, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(found.positions, expected, rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize("solver", sorted(set(SOLVER_INSTANCES) - {*TAKE, "avbd", "vbd-ogc"}))  # both are vbd here
@@ -70,14 +70,14 @@ def test_others_refuse_contact_by_name(solver):
 @pytest.mark.parametrize("solver", [*PREFACTORED_SOLVERS, "vbd"])
 def test_no_iteration_raises_the_objective(solver, scene, few, monkeypatch):
     monkeypatch.setattr(method, "_MAX_WOODBURY_ROWS", few)
-    problem, wanted = find_contact_step(scene)
+    problem, expected = find_contact_step(scene)
     problem = replace(problem, initial_guess=problem.inertial_target)  # deep inside
     values = [problem.value(problem.initial_guess)]
     for p in islice(SOLVER_INSTANCES[solver].prepare(problem.system).iterates(problem), 30):
         values.append(problem.value(p))
         assert values[-1] <= values[-2] + 1e-12 * problem.value_scale(p)  # sums of some hundred terms
-    scale = values[0] - problem.value(wanted)
-    assert values[-1] - problem.value(wanted) <= 1e-2 * scale
+    scale = values[0] - problem.value(expected)
+    assert values[-1] - problem.value(expected) <= 1e-2 * scale
 
 
 @pytest.mark.parametrize("scene", ["friction", "held exactly"])
@@ -119,5 +119,5 @@ def test_a_solve_ends_at_exactly_the_iterate_of_its_number(solver):
     problem, _ = find_contact_step("friction")
     prepared = SOLVER_INSTANCES[solver].prepare(problem.system)
     for count in (1, 3):
-        wanted = [p.copy() for p in islice(prepared.iterates(problem), count)][-1]
-        np.testing.assert_array_equal(prepared.solve(problem, StopRule(count)).positions, wanted)
+        expected = [p.copy() for p in islice(prepared.iterates(problem), count)][-1]
+        np.testing.assert_array_equal(prepared.solve(problem, StopRule(count)).positions, expected)

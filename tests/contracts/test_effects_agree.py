@@ -53,7 +53,7 @@ def minimum(scene: str, integrator: str) -> tuple[StepProblem, Positions]:
 @pytest.mark.parametrize("solver", MINIMISERS)
 def test_solvers_agree_at_convergence_or_refuse_by_name(solver, scene):
     for integrator in INTEGRATORS if "all" in scene and "gas" not in scene else INTEGRATORS[:1]:
-        problem, wanted = minimum(scene, integrator)
+        problem, expected = minimum(scene, integrator)
         if not takes(solver, scene):
             with pytest.raises(Unsupported) as refusal:
                 MINIMISERS[solver].prepare(problem.system)
@@ -66,12 +66,12 @@ def test_solvers_agree_at_convergence_or_refuse_by_name(solver, scene):
             if solver == "newton-cg" and near:
                 far = prepared.solve(problem, STOP).positions
                 assert_minimum(problem, far)
-                assert problem.value(far) < problem.value(wanted)
+                assert problem.value(far) < problem.value(expected)
             if near:
-                problem = replace(problem, initial_guess=wanted + near * NOISE.normal(size=wanted.shape))
+                problem = replace(problem, initial_guess=expected + near * NOISE.normal(size=expected.shape))
             found = prepared.solve(problem, STOP).positions
             # Local-global converges linearly: its last step, 1e-11 of the first, is up to 1e-3 of what is left to go.
-            np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-7)
+            np.testing.assert_allclose(found, expected, rtol=0, atol=1e-7)
 
 
 @pytest.mark.parametrize("scene", EFFECT_SCENES)

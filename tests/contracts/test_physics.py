@@ -98,9 +98,9 @@ def test_a_free_cloth_falls_as_a_stone_does(backend):
     made = build_test_scene(GridMesh(), SpringsEffect(stretch=300.0), GravityEffect(), size=6, time_step=DT)
     p = simulate_trajectory(made, backend, 40)
     n = np.arange(1, 41)[:, None]
-    wanted = made.mesh.rest_positions[:, 1] - G * DT**2 * n * (n + 1) / 2
+    expected = made.mesh.rest_positions[:, 1] - G * DT**2 * n * (n + 1) / 2
     # A thousand roundings of a fall of 9 m, which the cloth's own vibration carries on: 1e-12 to 1e-11.
-    np.testing.assert_allclose(p[:, :, 1], wanted, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(p[:, :, 1], expected, rtol=0, atol=1e-10)
     np.testing.assert_allclose(
         p[:, :, [0, 2]], made.mesh.rest_positions[:, [0, 2]][None].repeat(40, 0), rtol=0, atol=1e-10
     )

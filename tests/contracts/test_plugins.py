@@ -191,8 +191,8 @@ def test_a_fresh_environment_takes_both_packages_and_sweeps_with_them(tmp_path: 
     """This project and a user's, with all that they need, from the package index."""
     venv.create(tmp_path / "fresh", with_pip=True)
     bin, env = tmp_path / "fresh" / "bin", {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
-    wanted = [str(ROOT), str(build_wheel(tmp_path))]
-    subprocess.run([bin / "python", "-m", "pip", "install", "--quiet", *wanted], check=True, env=env)
+    expected = [str(ROOT), str(build_wheel(tmp_path))]
+    subprocess.run([bin / "python", "-m", "pip", "install", "--quiet", *expected], check=True, env=env)
     configs(tmp_path, NAMING_FORMS["entry-point"])
     subprocess.run([bin / "springbench", "run", "sweep.yaml"], cwd=tmp_path, check=True, env=env)
     (rows,) = (tmp_path / "results" / "sweep" / "rows").glob("*.parquet")

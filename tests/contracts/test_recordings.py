@@ -231,8 +231,8 @@ def test_an_arrow_begins_at_its_vertex_and_points_along_its_force(tmp_path: Path
         found = [chunk.to_record_batch() for chunk in source.iterate_chunks(content="/scene/forces/external")]
     (batch,) = [one for one in found if "Arrows3D:vectors" in one.schema.names]
     vectors, origins = (read_cell(batch, f"Arrows3D:{name}").reshape(-1, 3) for name in ("vectors", "origins"))
-    wanted = 0.15 * size * np.array([[0.0, -1.0, 0.0], [0.6 * 5 / 9.81, 0.0, 0.8 * 5 / 9.81]])
-    np.testing.assert_allclose(vectors, wanted, rtol=1e-6)
+    expected = 0.15 * size * np.array([[0.0, -1.0, 0.0], [0.6 * 5 / 9.81, 0.0, 0.8 * 5 / 9.81]])
+    np.testing.assert_allclose(vectors, expected, rtol=1e-6)
     np.testing.assert_allclose(origins, frame.positions[[3, 7]], rtol=1e-6)
 
 

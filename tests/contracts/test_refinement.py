@@ -62,8 +62,8 @@ CHAINS = [(20.0, 2.0), (100.0, 2.0), (100.0, 2.6), (50.0, 1.2), (300.0, 1.6)]
 def test_a_hanging_chain_takes_the_shape_of_the_elastic_catenary(ea, span):
     errors = []
     for size in (9, 17, 33):
-        wanted = elastic_catenary(ea, span, np.linspace(0, LENGTH, size))
-        errors.append(np.abs(hanging_chain(ea, span, size)[:, :2].T - wanted).max())
+        expected = elastic_catenary(ea, span, np.linspace(0, LENGTH, size))
+        errors.append(np.abs(hanging_chain(ea, span, size)[:, :2].T - expected).max())
     # A chain of links is the midpoint rule for the cable's integrals: the error falls as h^2, by 4 a halving;
     # the next term, of h^4, still shows in the coarsest chain.
     assert errors[-1] < 1e-3 * LENGTH

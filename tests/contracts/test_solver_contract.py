@@ -136,8 +136,8 @@ def test_phases_may_run_at_any_time_and_leave_the_solver_as_it_was(solver, probl
     phases = prepared.iteration_phases(problem)
     for phase in (*phases.values(), *reversed(phases.values())):
         phase()
-    for p, wanted in zip(iterates(prepared, problem, 3), before, strict=True):
-        np.testing.assert_array_equal(p, wanted)
+    for p, expected in zip(iterates(prepared, problem, 3), before, strict=True):
+        np.testing.assert_array_equal(p, expected)
 
 
 @over(LOCAL_GLOBAL)

@@ -64,22 +64,22 @@ def outcome(made: Scene, method: str, precision: Precision) -> Outcome:
         found = simulate_steps(made, solver(device="cuda", precision=precision))
     except Unsupported as error:
         return Outcome(*_classify_refusal(str(error), made, solver))
-    wanted, begun = simulate_steps(made, solver()), build_initial_state(made).motion.positions
+    expected, begun = simulate_steps(made, solver()), build_initial_state(made).motion.positions
     if not np.isfinite(found).all():
-        return Outcome("wrong" if np.isfinite(wanted).all() else "right", "not finite")
+        return Outcome("wrong" if np.isfinite(expected).all() else "right", "not finite")
     length = float(made.all_springs.rest_length.mean()) if len(made.all_springs.rest_length) else 1.0
     part, near = ROUND_OFF[precision]
     rounded = part * (length + (np.abs(begun).max() if precision == "float64" else 0.0))
-    may = near * (length + np.abs(wanted - begun).max()) + rounded
-    away = np.abs(found - wanted).max()
+    may = near * (length + np.abs(expected - begun).max()) + rounded
+    away = np.abs(found - expected).max()
     for seed in range(3):
         if away <= may:
             break
         changes = rounded * np.random.default_rng(seed).uniform(-1.0, 1.0, (2, *begun.shape))
-        may = max(may, TIMES * np.abs(simulate_steps(made, solver(), changes) - wanted).max())
+        may = max(may, TIMES * np.abs(simulate_steps(made, solver(), changes) - expected).max())
     why = f"{away:.1e} m from the processor"
     if away > may and precision == "float32" and solver().is_minimiser:
-        part = _fall(made, found[0]) / _fall(made, wanted[0])
+        part = _fall(made, found[0]) / _fall(made, expected[0])
         away, why = may * (1.0 - part) / LESS, f"{why}, its first step falling by {part:.4f} of what that one's does"
     return Outcome("right" if away <= may else "wrong", why, float(away / may))
 

@@ -26,7 +26,7 @@ def iterates(solver: Any, problem: StepProblem, count: int) -> list[Positions]:
 def same_iterates(method: Callable[..., Any], problem: StepProblem, count: int) -> None:
     """So many iterates on a device are the processor's: to 1e-10 m in float64, and in float32 to 1e-5 of the springs'
     mean length."""
-    wanted = iterates(method(), problem, count)
+    expected = iterates(method(), problem, count)
     for precision, close in zip(PRECISIONS, (1e-10, 1e-5 * spacing(problem)), strict=True):
         found = iterates(method(device="cuda", precision=precision), problem, count)
-        np.testing.assert_allclose(found, wanted, rtol=0, atol=close, err_msg=precision)
+        np.testing.assert_allclose(found, expected, rtol=0, atol=close, err_msg=precision)

@@ -57,13 +57,13 @@ def test_bits_and_velocities_do_not_depend_on_observers(method: Callable[..., An
     replayed, solved = prepared.replay_iterations(problem, 4)[0], prepared.solve(problem, rule)
     np.testing.assert_array_equal(replayed.positions, looked_at)
     np.testing.assert_array_equal(solved.positions, looked_at)
-    wanted = method().prepare(problem.system).solve(problem, rule).velocity
-    if wanted is None:
+    expected = method().prepare(problem.system).solve(problem, rule).velocity
+    if expected is None:
         assert replayed.velocity is None
     else:
         assert replayed.velocity is not None
         # Of displacements in float32, which are wrong in the last of their digits, a hundredth of a second each.
-        np.testing.assert_allclose(replayed.velocity, wanted, rtol=0, atol=1e-5)
+        np.testing.assert_allclose(replayed.velocity, expected, rtol=0, atol=1e-5)
         np.testing.assert_array_equal(solved.velocity, replayed.velocity)
 
 

@@ -122,8 +122,8 @@ def test_a_hanging_elastic_chain_tends_to_the_elastic_catenary_with_order_two(so
 def test_a_stiffer_and_stiffer_chain_tends_to_inextensible_links_with_order_one(solver, support):
     """Links stretch by T / EA: 1e-2 to 1e-8 of their length."""
     stiffness = [WEIGHT * 10.0**k for k in range(2, 9)]
-    wanted = solve_hanging_shape(links(13), support)
-    errors = [np.abs(equilibrium(13, EA, support, solver) - wanted).max() for EA in stiffness]
+    expected = solve_hanging_shape(links(13), support)
+    errors = [np.abs(equilibrium(13, EA, support, solver) - expected).max() for EA in stiffness]
     # The next term is smaller by the strain, 1e-2 to begin with; round-off of the last, 1e-8, is 1e-15 of the length
     # over the stiffness of the bow next to that of the links.
     np.testing.assert_allclose(orders([1.0 / EA for EA in stiffness], errors), 1.0, rtol=0, atol=0.02)

@@ -141,9 +141,9 @@ def test_a_free_body_conserves_momentum(name: str, case: Case):
 @EXAMPLES
 @given(case=networks())
 def test_a_free_body_at_rest_length_moves_uniformly(name: str, case: Case):
-    free, wanted = case.flying()
-    atol = 100 * EPS * case.worst * np.abs(wanted).max()
-    np.testing.assert_allclose(ends(name, free), wanted, rtol=0, atol=atol)
+    free, expected = case.flying()
+    atol = 100 * EPS * case.worst * np.abs(expected).max()
+    np.testing.assert_allclose(ends(name, free), expected, rtol=0, atol=atol)
 
 
 @minimisers

@@ -125,8 +125,8 @@ def test_a_free_body_conserves_momentum(name: str, case: Case):
     mass, begun = free.system.mass[:, None], free.step_start
     moved = (mass * (solve_converged(name, start_near_minimum(case, free).problem) - begun.positions)).sum(axis=0) / DT
     scale = (mass * np.abs(begun.positions)).sum() / DT  # what the differences above are taken of
-    wanted = (mass * begun.velocity).sum(axis=0)
-    np.testing.assert_allclose(moved, wanted, rtol=0, atol=100 * EPS * case.worst * scale)
+    expected = (mass * begun.velocity).sum(axis=0)
+    np.testing.assert_allclose(moved, expected, rtol=0, atol=100 * EPS * case.worst * scale)
 
 
 @converging
@@ -134,9 +134,9 @@ def test_a_free_body_conserves_momentum(name: str, case: Case):
 @given(case=networks())
 def test_a_free_body_at_rest_length_moves_uniformly(name: str, case: Case):
     case = for_method(name, case)
-    free, wanted = case.flying()
-    atol = 100 * EPS * case.worst * np.abs(wanted).max()
-    np.testing.assert_allclose(solve_converged(name, free), wanted, rtol=0, atol=atol)
+    free, expected = case.flying()
+    atol = 100 * EPS * case.worst * np.abs(expected).max()
+    np.testing.assert_allclose(solve_converged(name, free), expected, rtol=0, atol=atol)
 
 
 STEPS = 4

@@ -58,10 +58,10 @@ def test_stiff_bending_leaves_its_matrix_positive_definite(sweeps):
 
 @pytest.mark.parametrize("sweeps", [1, 2, 5])
 def test_it_ends_at_the_minimum_whatever_the_sweeps(sweeps):
-    wanted = NewtonSolver().prepare(HANGING.system).solve(HANGING, StopRule(100, 1e-12)).positions
+    expected = NewtonSolver().prepare(HANGING.system).solve(HANGING, StopRule(100, 1e-12)).positions
     found = AggregatedJacobi(sweeps).prepare(HANGING.system).solve(HANGING, StopRule(5000, 1e-8))
     assert found.termination_reason == "converged"
-    np.testing.assert_allclose(found.positions, wanted, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(found.positions, expected, rtol=0, atol=1e-6)
 
 
 def test_more_sweeps_take_fewer_iterations():

@@ -104,9 +104,9 @@ def test_a_run_returns_its_gradient_and_the_decrease_of_the_objective(method, na
         # A dozen differences, each of which may be round-off of the terms, here or where the run started.
         size = max(size, problem.value_scale(run.positions))
         assert abs(start - problem.value(run.positions) - run.objective_decrease) <= 12 * 4 * np.finfo(float).eps * size
-        wanted = problem.gradient(run.positions)
-        wanted[pins.vertices[exact]] = 0.0
-        assert (np.abs(run.gradient() - wanted) <= 1e-15 * stiffness[:, None] * compute_max_coordinate(problem)).all()
+        expected = problem.gradient(run.positions)
+        expected[pins.vertices[exact]] = 0.0
+        assert (np.abs(run.gradient() - expected) <= 1e-15 * stiffness[:, None] * compute_max_coordinate(problem)).all()
 
 
 @methods

@@ -32,10 +32,10 @@ def test_the_first_iteration_with_the_weight_one_is_local_global():
 
 @pytest.mark.parametrize("weight", [0.1, 1.0, 3.0])
 def test_it_ends_at_the_minimum_whatever_the_weight(weight):
-    wanted = NewtonSolver().prepare(HANGING.system).solve(HANGING, StopRule(100, 1e-12)).positions
+    expected = NewtonSolver().prepare(HANGING.system).solve(HANGING, StopRule(100, 1e-12)).positions
     found = Admm(weight).prepare(HANGING.system).solve(HANGING, StopRule(5000, 1e-8))
     assert found.termination_reason == "converged"
-    np.testing.assert_allclose(found.positions, wanted, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(found.positions, expected, rtol=0, atol=1e-6)
 
 
 def test_a_small_weight_takes_fewer_iterations_where_springs_hang():

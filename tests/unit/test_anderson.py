@@ -53,8 +53,10 @@ def by_least_squares(problem: StepProblem, pairs: int, count: int) -> list[Posit
 @pytest.mark.parametrize("linear", ["supernodal", "cholespy"])
 def test_iterates_are_those_of_the_least_squares_problem(name, pairs, linear):
     problem = PROBLEMS[name]()
-    wanted = by_least_squares(problem, pairs, 10)
-    for p, q in zip(islice(Anderson(pairs, linear).prepare(problem.system).iterates(problem), 10), wanted, strict=True):
+    expected = by_least_squares(problem, pairs, 10)
+    for p, q in zip(
+        islice(Anderson(pairs, linear).prepare(problem.system).iterates(problem), 10), expected, strict=True
+    ):
         # Normal equations lose twice the digits that the differences' dependence costs LAPACK.
         assert np.abs(p - q).max() <= 1e-6 * np.abs(q).max()
 

@@ -63,8 +63,8 @@ def test_a_solve_agrees_with_scipy(A):
     b = np.random.default_rng(2).normal(size=(len(A.indptr) - 1, 3))
     factor = BlockCholesky(graph_of(A))
     assert factor.factorise(entries(A))
-    wanted = np.asarray(spsolve(A.tocsc(), b.ravel())).reshape(-1, 3)
-    np.testing.assert_allclose(factor.solve(b), wanted, rtol=0, atol=ROUND_OFF * np.abs(wanted).max())
+    expected = np.asarray(spsolve(A.tocsc(), b.ravel())).reshape(-1, 3)
+    np.testing.assert_allclose(factor.solve(b), expected, rtol=0, atol=ROUND_OFF * np.abs(expected).max())
     np.testing.assert_array_equal(BlockCholesky(graph_of(A)).factorise_and_solve(entries(A), b), factor.solve(b))
 
 
@@ -157,9 +157,9 @@ def test_numbers_are_blocks_of_one(A):
     values, n = entries(A)[:, :1, :1].copy(), len(A.indptr) - 1
     b = np.random.default_rng(4).normal(size=(n, 1))
     found = BlockCholesky(graph_of(A), block_size=1).factorise_and_solve(values, b)
-    wanted = np.asarray(spsolve(csc_array(csr_array((values.ravel(), A.indices, A.indptr), shape=(n, n))), b.ravel()))
+    expected = np.asarray(spsolve(csc_array(csr_array((values.ravel(), A.indices, A.indptr), shape=(n, n))), b.ravel()))
     assert found is not None
-    np.testing.assert_allclose(found.ravel(), wanted, rtol=0, atol=ROUND_OFF * np.abs(wanted).max())
+    np.testing.assert_allclose(found.ravel(), expected, rtol=0, atol=ROUND_OFF * np.abs(expected).max())
 
 
 @pytest.mark.usefixtures("always_by_threads")

@@ -47,9 +47,9 @@ def test_the_estimate_tends_to_the_radius_of_convergence_and_not_beyond(name):
     run = prepared.init_state(problem, problem.initial_guess)
     run.run_iterations(LoopLimits(4000, 1e-9 * run.residual(), 0.0, RESIDUAL_EACH))
     now = run._window.window_state  # type: ignore[attr-defined]  the runs of every engine have one
-    wanted, found = radius(problem, run.positions), float(now["spectral_radius"][0])
+    expected, found = radius(problem, run.positions), float(now["spectral_radius"][0])
     # The rate goes with the root of 1 - rho: twice too far from 1 costs 1.4 times the iterations, half as far too.
-    assert 0.5 <= (1.0 - found) / (1.0 - wanted) <= 3.0
+    assert 0.5 <= (1.0 - found) / (1.0 - expected) <= 3.0
 
 
 @problems

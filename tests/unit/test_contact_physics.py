@@ -51,9 +51,9 @@ def test_a_sheet_on_a_sheet_slides_above_the_angle_of_friction_and_rests_below_w
     assert rests[-1] < 1e-3  # the creep; what it gathered while the first steps' pressure was none is gone
     slides, _ = slide(1.05 * MU, 25)
     assert slides[-1] > slides[12] > 0.05
-    slides, wanted = slide(1.5 * MU, 25)
+    slides, expected = slide(1.5 * MU, 25)
     # Settled after 0.08 s, and not yet beyond the lower sheet's side by more than a cell.
-    assert (slides[24] - slides[8]) / (16 * DT) == pytest.approx(wanted, rel=0.05)
+    assert (slides[24] - slides[8]) / (16 * DT) == pytest.approx(expected, rel=0.05)
 
 
 @pytest.mark.long

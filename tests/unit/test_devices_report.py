@@ -96,9 +96,9 @@ def test_the_report_draws_the_ratio_and_the_page_states_it(there: bool, tmp_path
     said = " ".join(done.output.split())
     picture = tmp_path / "r" / "gpu" / "pictures" / "devices.png"
     assert picture.exists() is there
-    wanted = "a device pays from 100" if there else "nothing is said of what one saves"
-    assert wanted in said
-    assert wanted in (tmp_path / "r" / "site" / "data" / "index.js").read_text()
+    expected = "a device pays from 100" if there else "nothing is said of what one saves"
+    assert expected in said
+    assert expected in (tmp_path / "r" / "site" / "data" / "index.js").read_text()
     if there:
         with Image.open(picture) as image:
             assert np.asarray(image.convert("L")).min() < 100, "something is drawn"

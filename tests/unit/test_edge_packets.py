@@ -146,18 +146,18 @@ def test_packets_have_the_gradient_the_energy_and_the_projection_of_the_energies
     q = p + 0.3 * np.random.default_rng(1).normal(size=p.shape)
     q[FIXED_VERTEX] = p[FIXED_VERTEX]
     found, other = evaluate(network, p), evaluate(network, q)
-    wanted, projected, rise = (
+    expected, projected, rise = (
         ANCHOR_STIFFNESS * p,
         np.zeros_like(p),
         0.5 * ANCHOR_STIFFNESS * float(np.sum(q[:-1] ** 2) - np.sum(p[:-1] ** 2)),
     )
     for energy in (network.springs, *network.energies):
-        energy.add_gradient(p, wanted)
+        energy.add_gradient(p, expected)
         energy.add_projection(p, projected)
         rise += energy.value(q) - energy.value(p)
-    size = np.abs(wanted).max()
+    size = np.abs(expected).max()
     for descent in found.descent:
-        np.testing.assert_allclose(descent, -wanted[:FIXED_VERTEX], rtol=0, atol=ROUNDOFF * size)
+        np.testing.assert_allclose(descent, -expected[:FIXED_VERTEX], rtol=0, atol=ROUNDOFF * size)
     np.testing.assert_allclose(found.projection, projected[:FIXED_VERTEX], rtol=0, atol=ROUNDOFF * size)
     assert other.value - found.value == pytest.approx(rise, abs=1e-12 * (abs(found.value) + abs(other.value)))
 
@@ -177,8 +177,8 @@ def test_vertex_models_have_the_gradients_and_blocks_of_the_energies(kind):
     added = found.models - plain.models
     size = np.abs(found.models).max()
     np.testing.assert_allclose(added[:, :3], -gradient[:FIXED_VERTEX], rtol=0, atol=ROUNDOFF * size)
-    wanted = blocks[:FIXED_VERTEX][:, *np.triu_indices(3)]
-    np.testing.assert_allclose(added[:, 3:], wanted, rtol=0, atol=ROUNDOFF * size)
+    expected = blocks[:FIXED_VERTEX][:, *np.triu_indices(3)]
+    np.testing.assert_allclose(added[:, 3:], expected, rtol=0, atol=ROUNDOFF * size)
 
 
 @pytest.mark.parametrize("kind", ["limits", "dashpots", "limits and dashpots"])
@@ -205,10 +205,12 @@ def test_limits_may_change_from_step_to_step():
     moved = replace(limits, min_length=0.5 * limits.min_length, max_length=0.7 * limits.max_length)
     edges = network.packets.edges.with_limits(moved.min_length, moved.max_length)
     found = evaluate(network, network.positions, network.packets._replace(edges=edges))
-    wanted = ANCHOR_STIFFNESS * network.positions
+    expected = ANCHOR_STIFFNESS * network.positions
     for energy in (network.springs, moved, *others):
-        energy.add_gradient(network.positions, wanted)
-    np.testing.assert_allclose(found.descent[0], -wanted[:FIXED_VERTEX], rtol=0, atol=ROUNDOFF * np.abs(wanted).max())
+        energy.add_gradient(network.positions, expected)
+    np.testing.assert_allclose(
+        found.descent[0], -expected[:FIXED_VERTEX], rtol=0, atol=ROUNDOFF * np.abs(expected).max()
+    )
 
 
 def test_an_edge_of_a_vertex_with_itself_acts_on_nothing():

@@ -76,9 +76,9 @@ def test_a_block_slides_on_a_slope_above_the_friction_angle(friction):
     weight = made.system.mass / made.system.mass.sum()
     x = np.array([weight @ step.positions[:, 0] for step in collect_steps(made, 120)])
     angle = np.arctan(1.05 * friction)
-    wanted = 9.81 * (np.sin(angle) - friction * np.cos(angle))
+    expected = 9.81 * (np.sin(angle) - friction * np.cos(angle))
     found = np.diff(x, 2)[60:].mean() * 60**2
-    assert found == pytest.approx(wanted, rel=1e-2)  # the block still rocks a little from its start
+    assert found == pytest.approx(expected, rel=1e-2)  # the block still rocks a little from its start
 
 
 @pytest.mark.parametrize("friction", [0.2, 0.5])

@@ -84,9 +84,9 @@ def test_a_pendulum_in_quadratic_drag_decays_as_one_over_time():
     """m x'' = -k |x'| x' - m g x / l: 1/A grows by 4 k w l / (3 pi m) a second, by the work done in a period."""
     k, dt = 2.0, PERIOD / 200
     found = amplitudes(pendulum(AirDragEffect(drag_law="quadratic", coefficient=2 * k), dt), 5 * PERIOD, 0.01)
-    wanted = 4 * k * G**0.5 / (3 * np.pi)
+    expected = 4 * k * G**0.5 / (3 * np.pi)
     growth = (1 / found[-1] - 1 / found[0]) / (5 * PERIOD)
-    assert growth == pytest.approx(wanted, rel=0.01)  # averaging over a period errs by some k A/4
+    assert growth == pytest.approx(expected, rel=0.01)  # averaging over a period errs by some k A/4
 
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
@@ -134,9 +134,9 @@ def test_an_oscillator_decays_at_its_rate(case):
     path = moving(oscillator(effect), np.zeros((2, 3)), steps, np.array([[-0.005, 0, 0], [1.005, 0, 0]]))
     length = np.array([now.positions[1, 0] - now.positions[0, 0] for now in path]) - 1.0
     t = 0.002 * np.arange(steps + 1)
-    wanted = 0.01 * np.exp(-rate * t) * (np.cos(w * t) + rate / w * np.sin(w * t))
+    expected = 0.01 * np.exp(-rate * t) * (np.cos(w * t) + rate / w * np.sin(w * t))
     # Midpoint's phase errs by (w dt)^2 / 12 = 7e-5 of 13 radians.
-    np.testing.assert_allclose(length, wanted, rtol=0, atol=0.002 * 0.01)
+    np.testing.assert_allclose(length, expected, rtol=0, atol=0.002 * 0.01)
 
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
@@ -196,8 +196,8 @@ def test_rayleigh_damping_takes_the_matrix_of_bending():
     bending, damping = made.system.energies
     assert isinstance(damping, RayleighDamping)
     n = len(made.mesh.rest_positions)
-    found, wanted = damping.stiffness_matrix(n), bending.stiffness_matrix(n)  # pyright: ignore[reportAttributeAccessIssue]
-    assert np.abs(found - 0.5 * wanted).max() <= 1e-14 * np.abs(wanted).max()  # at the rate of 1/s
+    found, expected = damping.stiffness_matrix(n), bending.stiffness_matrix(n)  # pyright: ignore[reportAttributeAccessIssue]
+    assert np.abs(found - 0.5 * expected).max() <= 1e-14 * np.abs(expected).max()  # at the rate of 1/s
 
 
 def test_damping_is_the_same_in_the_first_step_of_an_integrator_that_needs_a_history():

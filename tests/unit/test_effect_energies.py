@@ -56,8 +56,8 @@ def test_the_hessian_is_the_slope_of_the_gradient(case):
     p, u = places(problem)
     for energy in problem.energies:
         found = (gradient(energy, p + STEP * u) - gradient(energy, p - STEP * u)) / (2 * STEP)
-        wanted = (energy.hessian(p) @ u.ravel()).reshape(p.shape)
-        assert np.linalg.norm(found - wanted) <= 1e-5 * np.linalg.norm(wanted)  # as above
+        expected = (energy.hessian(p) @ u.ravel()).reshape(p.shape)
+        assert np.linalg.norm(found - expected) <= 1e-5 * np.linalg.norm(expected)  # as above
 
 
 @problems
@@ -75,10 +75,10 @@ def test_a_projective_energys_gradient_is_its_stiffness_less_its_projection(case
     p, _ = places(problem)
     for energy in problem.energies:
         if isinstance(energy, ProjectiveEnergy):
-            wanted = energy.stiffness_matrix(len(p)) @ p
+            expected = energy.stiffness_matrix(len(p)) @ p
             energy.add_projection(p, pulled := np.zeros_like(p))
-            scale = np.abs(wanted).max()  # whose last digits cancel
-            np.testing.assert_allclose(gradient(energy, p), wanted - pulled, rtol=0, atol=1e-13 * scale)
+            scale = np.abs(expected).max()  # whose last digits cancel
+            np.testing.assert_allclose(gradient(energy, p), expected - pulled, rtol=0, atol=1e-13 * scale)
 
 
 @problems
@@ -100,10 +100,10 @@ def test_the_system_matrix_has_the_stiffness_of_the_step(case):
     Q = assemble_system_matrix(problem.system, projective).toarray()
     s = problem.system
     pinned = s.inertia_diagonal + np.bincount(*s.penalty_pins[1:], minlength=n)
-    wanted = np.diag(pinned)
+    expected = np.diag(pinned)
     for energy in problem.energies:
-        wanted = wanted + (energy.stiffness_matrix(n).toarray() if isinstance(energy, ProjectiveEnergy) else 0.0)
-    assert np.abs(Q - wanted).max() <= 1e-13 * np.abs(wanted).max()  # the order of sums
+        expected = expected + (energy.stiffness_matrix(n).toarray() if isinstance(energy, ProjectiveEnergy) else 0.0)
+    assert np.abs(Q - expected).max() <= 1e-13 * np.abs(expected).max()  # the order of sums
 
 
 def test_a_lagged_energy_stores_no_state_of_a_step():

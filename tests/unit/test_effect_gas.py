@@ -49,11 +49,11 @@ def test_a_balloon_swells_to_the_radius_of_a_membrane(pressure):
     An isotropic strain e stores sqrt(3) k e^2 a unit of area: three springs a vertex, on sqrt(3)/2 h^2.
     """
     k = 100.0
-    wanted = brentq(lambda x: pressure * RADIUS / x - 2 * 3**0.5 * k * (x - 1), 1.0, 50.0)
+    expected = brentq(lambda x: pressure * RADIUS / x - 2 * 3**0.5 * k * (x - 1), 1.0, 50.0)
     made = build_test_scene(BalloonMesh(radius=RADIUS), SpringsEffect(stretch=k), GasEffect(pressure=pressure), size=6)
     p = compute_rest_shape(made, Lbfgs(), iterations=2000)
     radius = np.linalg.norm(p - p.mean(axis=0), axis=1).mean()
-    assert radius / RADIUS == pytest.approx(wanted, rel=0.005)  # the mesh is inside the sphere, by less than this
+    assert radius / RADIUS == pytest.approx(expected, rel=0.005)  # the mesh is inside the sphere, by less than this
 
 
 def test_pressure_times_volume_stays_what_it_is_at_rest():
@@ -167,13 +167,15 @@ def build_balloon_step(size: int, pressure: float) -> StepProblem:
 def test_gas_is_minimised_where_its_sparse_part_alone_has_saddles(solver):
     given = build_balloon_step(4, 200.0)
     found = solver.prepare(given.system).solve(given, StopRule(2000, 1e-9))
-    wanted = NewtonSolver().prepare(given.system).solve(given, StopRule(100, 1e-12)).positions
-    np.testing.assert_allclose(found.positions, wanted, atol=1e-7)  # 1e-9 of the first step's length, over what is soft
+    expected = NewtonSolver().prepare(given.system).solve(given, StopRule(100, 1e-12)).positions
+    np.testing.assert_allclose(
+        found.positions, expected, atol=1e-7
+    )  # 1e-9 of the first step's length, over what is soft
     step = StepObjective(FixedObjective(given.system), given)
-    H = build_free_hessian(given, wanted)
+    H = build_free_hessian(given, expected)
     assert np.linalg.eigvalsh(H.sparse.toarray())[0] < -0.1 < 0.1 < np.linalg.eigvalsh(H.toarray())[0]
-    assert is_positive_definite(step, wanted)
-    assert certify_minimum(given, wanted).is_certified
+    assert is_positive_definite(step, expected)
+    assert certify_minimum(given, expected).is_certified
 
 
 @pytest.mark.parametrize("at_rest", [False, True])

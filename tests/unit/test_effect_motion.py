@@ -105,9 +105,9 @@ def test_pins_are_on_their_path_at_the_end_of_each_step(integrator, weight):
     for step in simulate_scene(
         made, prepare(made, SparseLocalGlobal()), StopRule(60), initial_guess="previous", frames=12
     ):
-        wanted = SWING.transform_points(made.mesh.rest_positions[pinned], step.index / 30)
+        expected = SWING.transform_points(made.mesh.rest_positions[pinned], step.index / 30)
         # A penalty gives way by some newtons over 1e10 N/m, which midpoint carries on from step to step.
-        np.testing.assert_allclose(step.positions[pinned], wanted, rtol=0, atol=1e-8 if weight == 1e10 else 1e-14)
+        np.testing.assert_allclose(step.positions[pinned], expected, rtol=0, atol=1e-8 if weight == 1e10 else 1e-14)
 
 
 def test_a_chain_pulled_at_both_ends_gets_there():
@@ -178,7 +178,7 @@ def test_an_attachment_pulls_a_free_mass_behind_its_point_by_the_equation_of_mot
     """m x'' = -k (x - v t): x = v (t - sin(w t) / w)."""
     speed, w, seconds = 2.0, 5.0, 1.0
     motion = KeyFrameMotion(key_frames=(KeyFrame(time=0.0), KeyFrame(time=10.0, offset=(10 * speed, 0.0, 0.0))))
-    wanted, errors = speed * (seconds - np.sin(w * seconds) / w), []
+    expected, errors = speed * (seconds - np.sin(w * seconds) / w), []
     for dt in (0.01, 0.005, 0.0025):
         ends = AttachmentsEffect(parts=("ends",), stiffness=2 * w**2, motion=motion)
         made = with_integrator(build_test_scene(ChainMesh(), ends, size=2, mass=2.0, time_step=dt), integrator)
@@ -186,7 +186,7 @@ def test_an_attachment_pulls_a_free_mass_behind_its_point_by_the_equation_of_mot
             made, prepare(made, SparseLocalGlobal()), StopRule(1), initial_guess="previous", frames=round(1 / dt)
         )
         *_, last = run
-        errors.append(last.positions[0, 0] - wanted)
+        errors.append(last.positions[0, 0] - expected)
     order = 1 if integrator == "implicit-euler" else 2
     for coarse, fine in pairwise(errors):
         assert coarse / fine == pytest.approx(2**order, rel=0.15)  # the next order is w dt = 5 % and less

@@ -53,8 +53,8 @@ def test_a_chain_at_its_limit_yields_by_the_force_over_the_stiffness():
         mass=mass,
     )
     tension = 9.81 * np.cumsum(made.system.mass[::-1])[:-1][::-1]
-    wanted = 1 + np.where(tension > 0.1 * ea, (tension + 0.1 * stiff) / (ea + stiff), tension / ea)
-    np.testing.assert_allclose(ratios(made, compute_rest_shape(made)), wanted, rtol=1e-8)  # of convergence
+    expected = 1 + np.where(tension > 0.1 * ea, (tension + 0.1 * stiff) / (ea + stiff), tension / ea)
+    np.testing.assert_allclose(ratios(made, compute_rest_shape(made)), expected, rtol=1e-8)  # of convergence
 
 
 def test_springs_within_their_limits_have_no_force():

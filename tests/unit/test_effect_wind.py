@@ -44,8 +44,8 @@ def test_a_plate_feels_drag_along_the_wind_and_lift_across_it(angle):
     across *= np.sign(across[2] * np.cos(a)) if abs(np.cos(a)) > 1e-9 else 1.0
     found = force(velocity=tuple(speed * along), drag_coefficient=1.1, lift_coefficient=0.6).sum(axis=0)
     pressure = RHO / 2 * AREA * speed**2 * abs(np.cos(a))
-    wanted = pressure * (1.1 * along + 0.6 * abs(np.sin(a)) * across)
-    np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-13 * RHO * AREA * speed**2)  # sums of 32 triangles
+    expected = pressure * (1.1 * along + 0.6 * abs(np.sin(a)) * across)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-13 * RHO * AREA * speed**2)  # sums of 32 triangles
 
 
 def test_only_the_velocity_of_the_air_relative_to_the_triangle_counts():
@@ -58,8 +58,10 @@ def test_only_the_velocity_of_the_air_relative_to_the_triangle_counts():
 
 def test_the_force_does_not_depend_on_the_orientation_of_triangles():
     mirrored = PLATE.rest_positions * [-1.0, 1.0, 1.0]  # their normals now point the other way
-    found, wanted = (force(p, velocity=(0.0, 0.0, 5.0), lift_coefficient=0.4) for p in (mirrored, PLATE.rest_positions))
-    np.testing.assert_allclose(found, wanted, rtol=1e-13)
+    found, expected = (
+        force(p, velocity=(0.0, 0.0, 5.0), lift_coefficient=0.4) for p in (mirrored, PLATE.rest_positions)
+    )
+    np.testing.assert_allclose(found, expected, rtol=1e-13)
 
 
 def test_a_sheet_falls_at_the_speed_at_which_drag_carries_it():
@@ -71,9 +73,9 @@ def test_a_sheet_falls_at_the_speed_at_which_drag_carries_it():
     *_, last = simulate_scene(
         made, prepare(made, SparseLocalGlobal()), StopRule(10), initial_guess="inertial", frames=600
     )
-    wanted = (2 * 0.4 * 9.81 / (RHO * 1.3)) ** 0.5
+    expected = (2 * 0.4 * 9.81 / (RHO * 1.3)) ** 0.5
     fall = -made.system.mass @ last.state.motion.velocity[:, 1] / 0.4
-    assert fall == pytest.approx(wanted, rel=1e-3)  # the sheet is a little bent, since its rim is lighter
+    assert fall == pytest.approx(expected, rel=1e-3)  # the sheet is a little bent, since its rim is lighter
 
 
 def test_no_triangle_is_blown_faster_than_the_air():
@@ -138,9 +140,9 @@ def test_gusts_vary_by_their_fraction_about_the_mean():
 
 
 def test_gusts_of_nothing_are_the_constant_wind():
-    wanted = force(velocity=(6.0, 0.0, 8.0))
+    expected = force(velocity=(6.0, 0.0, 8.0))
     np.testing.assert_allclose(
-        force(velocity=(6.0, 0.0, 8.0), field="gusts", turbulence_intensity=0.0), wanted, rtol=1e-14
+        force(velocity=(6.0, 0.0, 8.0), field="gusts", turbulence_intensity=0.0), expected, rtol=1e-14
     )
 
 
@@ -166,8 +168,8 @@ def test_the_assignments_field_on_triangles_is_a_velocity():
     found = force(field="assignment", t=1.7).sum(axis=0)
     phi = PLATE.rest_positions[PLATE.triangles].mean(axis=1)[:, 0] / 2.5 + 1.7
     u = np.stack([3 + 1.5 * (1 + np.cos(5 * phi)), 1 + np.cos(0.3 + phi), np.sin(phi)], axis=1)
-    wanted = (RHO / 2 * AREA / len(phi) * np.abs(u[:, [2]]) * u).sum(axis=0)
-    np.testing.assert_allclose(found, wanted, rtol=1e-12)
+    expected = (RHO / 2 * AREA / len(phi) * np.abs(u[:, [2]]) * u).sum(axis=0)
+    np.testing.assert_allclose(found, expected, rtol=1e-12)
 
 
 @pytest.mark.parametrize(

@@ -76,10 +76,10 @@ def test_a_scene_without_effects_has_nothing_in_any_place():
 def test_forces_that_never_change_are_added_up_once():
     effects = GravityEffect(), ConstantForceEffect(force=(1.0, 2.0, 3.0)), WindEffect(force=(0.0, 0.0, 6.0))
     made = build_test_scene(ChainMesh(), *effects, size=4, mass=3.0)
-    wanted = (
+    expected = (
         np.outer(made.system.mass, [0, -9.81, 0]) + np.outer(made.mesh.mass_fractions, [0, 0, 6]) + np.array([1, 2, 3])
     )
-    np.testing.assert_allclose(made.constant_force, wanted, rtol=1e-15)
+    np.testing.assert_allclose(made.constant_force, expected, rtol=1e-15)
     assert made.varying_forces == ()
 
 
@@ -89,8 +89,8 @@ def test_the_name_of_an_effect_is_its_kind(kind):
 
 
 def test_gravity_is_mass_times_acceleration():
-    wanted = np.outer(MASS, [1.0, -9.81, 0.5])
-    np.testing.assert_array_equal(force_of(GravityEffect(acceleration=(1.0, -9.81, 0.5))), wanted)
+    expected = np.outer(MASS, [1.0, -9.81, 0.5])
+    np.testing.assert_array_equal(force_of(GravityEffect(acceleration=(1.0, -9.81, 0.5))), expected)
 
 
 def test_a_constant_force_is_the_same_on_every_vertex_whatever_its_mass():
@@ -117,8 +117,8 @@ def test_the_assignments_wind_is_its_formula():
     diagonal = np.sqrt(2.0**2 + 1.0**2)
     for i, force in enumerate(force_of(WindEffect(field="assignment", acts_on="vertex"))):
         phi = P[i, 0] / diagonal + T
-        wanted = [3 + 1.5 * (1 + np.cos(5 * phi)), 1 + np.cos(0.3 + phi), np.sin(phi)]
-        np.testing.assert_allclose(force, wanted, rtol=1e-14)  # the phase of a cosine has 1e-15
+        expected = [3 + 1.5 * (1 + np.cos(5 * phi)), 1 + np.cos(0.3 + phi), np.sin(phi)]
+        np.testing.assert_allclose(force, expected, rtol=1e-14)  # the phase of a cosine has 1e-15
 
 
 def test_the_assignments_wind_and_force_make_its_external_force():
@@ -161,14 +161,14 @@ SELECTIONS = {
 
 @pytest.mark.parametrize("case", SELECTIONS)
 def test_pins_fix_the_vertices_that_their_selectors_name(case):
-    selectors, wanted = SELECTIONS[case]
-    assert select_vertices(**selectors) == list(wanted)
+    selectors, expected = SELECTIONS[case]
+    assert select_vertices(**selectors) == list(expected)
 
 
-@pytest.mark.parametrize(("weight", "wanted"), [(5.0, 5.0), ("exact", np.inf)])
-def test_pins_have_their_weight(weight, wanted):
+@pytest.mark.parametrize(("weight", "expected"), [(5.0, 5.0), ("exact", np.inf)])
+def test_pins_have_their_weight(weight, expected):
     (pin,) = build_contribution(PinsEffect(parts=("top",), weight=weight)).pins
-    assert pin.weight == wanted
+    assert pin.weight == expected
 
 
 def test_pins_weigh_what_the_assignments_do_by_default():
@@ -186,7 +186,7 @@ SHEET_WITH_HOLE = replace(
 
 
 @pytest.mark.parametrize(
-    ("selectors", "wanted"),
+    ("selectors", "expected"),
     [
         ({"boundary_loops": (1,)}, [6, 7, 11, 13, 17, 18]),
         ({"holes": (0,)}, [6, 7, 11, 13, 17, 18]),
@@ -195,11 +195,11 @@ SHEET_WITH_HOLE = replace(
         ({"attribute": {"name": "weight", "high": 0.08}, "indices": (9,)}, [0, 1, 2, 9]),
     ],
 )
-def test_holes_and_numbers_of_a_file_select_the_vertices_of_the_reference(selectors, wanted):
+def test_holes_and_numbers_of_a_file_select_the_vertices_of_the_reference(selectors, expected):
     pins = PinsEffect.model_validate(selectors)
     assert (
         pins.select_vertices(SHEET_WITH_HOLE, "pins").tolist()
-        == wanted
+        == expected
         == reference_selection(SceneDeclaration(SHEET_WITH_HOLE, np.ones(25), DT, ()), pins)
     )
 
@@ -254,8 +254,8 @@ def test_invalid_pins_are_refused(data):
 def test_springs_take_the_stiffness_of_their_rule():
     (energy,) = build_contribution(SpringsEffect(stretch=100.0, shear=20.0, bend=0.01)).energies
     assert isinstance(energy, SpringsEnergy)
-    wanted = compute_spring_stiffness(MESH, scaling_rule="continuum", stretch=100.0, shear=20.0, bend=0.01)
-    np.testing.assert_array_equal(energy.stiffness, wanted)
+    expected = compute_spring_stiffness(MESH, scaling_rule="continuum", stretch=100.0, shear=20.0, bend=0.01)
+    np.testing.assert_array_equal(energy.stiffness, expected)
     np.testing.assert_array_equal(energy.edges, MESH.springs)
     np.testing.assert_allclose(energy.rest_length, MESH.rest_lengths, rtol=1e-15)
 

@@ -62,22 +62,22 @@ def test_the_value_is_that_of_the_energy(begun_energy):
 
 def test_the_gradient_is_that_of_the_energy(begun_energy):
     energy, p, _ = begun_energy
-    found, wanted = np.zeros_like(p), np.zeros_like(p)
+    found, expected = np.zeros_like(p), np.zeros_like(p)
     energy.element_law.add_gradient(energy.elements, p, found)
-    energy.add_gradient(p, wanted)
-    np.testing.assert_allclose(found, wanted, rtol=0, atol=SUMS * np.abs(wanted).max())
+    energy.add_gradient(p, expected)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=SUMS * np.abs(expected).max())
 
 
 def test_the_hessian_is_that_of_the_energy(begun_energy):
     energy, p, _ = begun_energy
-    wanted = csr_array(energy.hessian(p)).toarray()
-    np.testing.assert_allclose(hessian(energy, p), wanted, rtol=0, atol=SUMS * np.abs(wanted).max())
+    expected = csr_array(energy.hessian(p)).toarray()
+    np.testing.assert_allclose(hessian(energy, p), expected, rtol=0, atol=SUMS * np.abs(expected).max())
 
 
 def test_the_objective_change_is_the_difference_of_the_values(begun_energy):
     energy, p, q = begun_energy
-    wanted, size = energy.value(q) - energy.value(p), energy.value(q) + energy.value(p)
-    assert energy.element_law.energy_change(energy.elements, p, q) == pytest.approx(wanted, rel=0, abs=SUMS * size)
+    expected, size = energy.value(q) - energy.value(p), energy.value(q) + energy.value(p)
+    assert energy.element_law.energy_change(energy.elements, p, q) == pytest.approx(expected, rel=0, abs=SUMS * size)
 
 
 def test_the_objective_change_is_accurate_where_the_difference_of_values_has_no_digits(begun_energy):
@@ -85,9 +85,9 @@ def test_the_objective_change_is_accurate_where_the_difference_of_values_has_no_
     slope = np.zeros_like(p)
     energy.add_gradient(p, slope)
     q = p + 1e-13 * (q - p)
-    wanted = float((slope * (q - p)).sum())  # to first order; what follows is less by the length of the step
+    expected = float((slope * (q - p)).sum())  # to first order; what follows is less by the length of the step
     # A difference of values is off by 1e-16 of an energy of 1e13 times the rise.
-    assert energy.element_law.energy_change(energy.elements, p, q) == pytest.approx(wanted, rel=1e-5)
+    assert energy.element_law.energy_change(energy.elements, p, q) == pytest.approx(expected, rel=1e-5)
 
 
 def test_elements_have_constant_second_derivatives_exactly_where_declared(begun_energy):
@@ -102,13 +102,13 @@ def test_a_product_is_that_of_all_energies_together():
     p = step.apply_exact_pins(problem.initial_guess - [0, 0.03, 0])
     x = np.random.default_rng(2).normal(size=p.shape)
     x[problem.system.pins.vertices] = 0.0
-    wanted = problem.system.inertia_diagonal[:, None] * x
+    expected = problem.system.inertia_diagonal[:, None] * x
     for energy in problem.energies:
-        wanted += (csr_array(energy.hessian(p)) @ x.ravel()).reshape(-1, 3)
-    wanted[problem.system.pins.vertices[problem.system.pins.exact_mask]] = 0.0
+        expected += (csr_array(energy.hessian(p)) @ x.ravel()).reshape(-1, 3)
+    expected[problem.system.pins.vertices[problem.system.pins.exact_mask]] = 0.0
     _, vertices, weight = problem.system.penalty_pins
-    wanted[vertices] += weight[:, None] * x[vertices]
-    np.testing.assert_allclose(step.hessian(p).matvec(x), wanted, rtol=0, atol=SUMS * np.abs(wanted).max())
+    expected[vertices] += weight[:, None] * x[vertices]
+    np.testing.assert_allclose(step.hessian(p).matvec(x), expected, rtol=0, atol=SUMS * np.abs(expected).max())
 
 
 def test_energies_that_have_no_elements_in_a_step_are_left_out_of_it():

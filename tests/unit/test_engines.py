@@ -99,8 +99,8 @@ def test_an_engine_that_is_not_installed_gives_the_command_to_install_it_as_reas
 
     monkeypatch.setattr(external_engine, "import_module", none)
     engine = load_target(OPTIONAL_SOLVERS[name])()
-    wanted = rf"^{name}: .*pip install -e '\.\[{engine.engine_package.extra_name}\]'` in the checkout"
-    with pytest.raises(Unsupported, match=wanted):
+    expected = rf"^{name}: .*pip install -e '\.\[{engine.engine_package.extra_name}\]'` in the checkout"
+    with pytest.raises(Unsupported, match=expected):
         engine.prepare(build_engine_scene(*HANGING).system)
 
 
@@ -185,13 +185,13 @@ def test_pypbd_moves_one_spring_as_xpbd_in_small_steps_does(substeps: int):
     scene = build_engine_scene(SpringsEffect(stretch=500.0), GravityEffect(), pins, mesh=ChainMesh(), size=2)
     stated = build_problem(scene, build_initial_state(scene), "previous")
     found = ready("pypbd", scene.system).solve(stated, StopRule(substeps))
-    wanted = XpbdSmallSteps().prepare(scene.system).solve(stated, StopRule(substeps))
+    expected = XpbdSmallSteps().prepare(scene.system).solve(stated, StopRule(substeps))
     # It may compute in single precision.
-    np.testing.assert_allclose(found.positions, wanted.positions, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(found.positions, expected.positions, rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize(
-    ("parameters", "substeps", "wanted"),
+    ("parameters", "substeps", "expected"),
     [
         ({"newton_solver": "vbd", "iterations_per_substep": 300}, 1, "converged"),
         ({"newton_solver": "semi-implicit"}, 20, "semi-implicit"),
@@ -199,17 +199,17 @@ def test_pypbd_moves_one_spring_as_xpbd_in_small_steps_does(substeps: int):
     ],
 )
 def test_newton_physics_steps_springs_by_the_formulas_of_its_methods(
-    parameters: dict[str, Any], substeps: int, wanted: str
+    parameters: dict[str, Any], substeps: int, expected: str
 ):
     pins = PinsEffect.model_validate({"parts": ["first"], "weight": "exact"})
-    size, velocity = (2 if wanted == "xpbd" else 4), (0.3, 0.1, -0.2)  # its XPBD moves along all springs at once
+    size, velocity = (2 if expected == "xpbd" else 4), (0.3, 0.1, -0.2)  # its XPBD moves along all springs at once
     effects = SpringsEffect(stretch=500.0), GravityEffect(), pins
     scene = build_engine_scene(*effects, mesh=ChainMesh(), size=size, velocity=velocity)
     stated = build_problem(scene, build_initial_state(scene), "previous")
     found = ready("newton-physics", scene.system, **parameters).solve(stated, StopRule(substeps)).positions
-    if wanted == "semi-implicit":
+    if expected == "semi-implicit":
         should = semi_implicit(scene, stated, substeps, damping=0.0)[0]
-    elif wanted == "xpbd":
+    elif expected == "xpbd":
         should = XpbdSmallSteps().prepare(scene.system).solve(stated, StopRule(substeps)).positions
     else:
         same = build_engine_scene(*effects, mesh=ChainMesh(), size=size, velocity=velocity, integrator="implicit-euler")

@@ -47,10 +47,10 @@ BAD = {
 
 @pytest.mark.parametrize("name", BAD)
 def test_a_mistake_is_reported_with_the_expected_input(results: Path, name: str, tmp_path: Path) -> None:
-    (kind, *more), *wanted = BAD[name]
+    (kind, *more), *expected = BAD[name]
     result = CliRunner().invoke(app, ["figure", kind, str(results), *more, "-o", str(tmp_path)])
     assert result.exit_code == 2, result.output
-    assert all(words in result.output for words in wanted), result.output
+    assert all(words in result.output for words in expected), result.output
     assert not list(tmp_path.iterdir())
 
 

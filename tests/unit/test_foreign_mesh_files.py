@@ -75,8 +75,8 @@ def test_a_binary_ply_of_any_properties_is_read(order, mixed):
     assert found.points.tolist() == [list(point) for point in POINTS]
     assert found.vertex_attributes["red"].tolist() == [200, 201, 202, 203]
     rows = {k: (rows.tolist(), which.tolist()) for k, (rows, which) in found.faces.items()}
-    wanted = {3: ([[1, 2, 3]], [1]), 4: ([[0, 1, 2, 3]], [0])}
-    assert rows == (wanted if mixed else {3: ([[0, 1, 2], [0, 2, 3]], [0, 1])})
+    expected = {3: ([[1, 2, 3]], [1]), 4: ([[0, 1, 2, 3]], [0])}
+    assert rows == (expected if mixed else {3: ([[0, 1, 2], [0, 2, 3]], [0, 1])})
 
 
 def test_a_ply_gives_a_mesh_with_its_numbers_in_double_precision(tmp_path):

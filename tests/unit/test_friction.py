@@ -144,13 +144,13 @@ def test_surfaces_stick_below_the_angle_of_friction_and_slip_above(surface, inte
 def test_other_integrators_take_the_pressure_of_their_unknown(integrator):
     """Both are exact for a constant force, but for the first step of bdf2, which is of implicit Euler."""
     assert 0.0 < measure_slip(steps(pebble(STICKS, integrator=integrator), 12)) < 1.2 * 12 / 60 * 1e-5
-    found, wanted = measure_slip(steps(pebble(SLIPS, integrator=integrator), 30)), 0.5 * G * (SIN - SLIPS * COS) / 4
-    assert found == pytest.approx(wanted, rel=2e-3 if integrator == "bdf2" else 1e-4)
+    found, expected = measure_slip(steps(pebble(SLIPS, integrator=integrator), 30)), 0.5 * G * (SIN - SLIPS * COS) / 4
+    assert found == pytest.approx(expected, rel=2e-3 if integrator == "bdf2" else 1e-4)
 
 
 def test_a_slide_converges_with_order_1_by_implicit_euler():
-    wanted = 0.5 * G * (SIN - SLIPS * COS) / 4
-    coarse, fine = (abs(measure_slip(steps(pebble(SLIPS, dt), round(0.5 / dt))) - wanted) for dt in (1 / 30, 1 / 60))
+    expected = 0.5 * G * (SIN - SLIPS * COS) / 4
+    coarse, fine = (abs(measure_slip(steps(pebble(SLIPS, dt), round(0.5 / dt))) - expected) for dt in (1 / 30, 1 / 60))
     assert coarse / fine == pytest.approx(2.0, rel=0.02)
 
 

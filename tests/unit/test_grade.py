@@ -470,10 +470,10 @@ def test_there_are_at_least_fifteen_mistakes_each_with_a_program_that_makes_it()
 def test_programs_with_each_mistake_name_it(name, tmp_path):
     path, scene = load_case(tmp_path, name)
     grader, wrong = make_grader(path), dict[str, str]()
-    for mistake, wanted in mistaken_simulations.MISTAKES.items():
+    for mistake, expected in mistaken_simulations.MISTAKES.items():
         with np.errstate(all="ignore"):
             named, alike = name_mistake(grader, simulate(scene, 20, mistake))
-        if named != wanted and wanted not in alike:
+        if named != expected and expected not in alike:
             wrong[mistake] = named
     assert wrong == {}
 
@@ -485,7 +485,7 @@ def test_mistakes_on_the_published_scenes_are_named_or_reported_as_invisible(nam
     if not path.exists():
         pytest.skip("the assignment's scenes are not part of this repository")
     scene, grader, wrong = read_scene(path), make_grader(path), dict[str, str]()
-    for mistake, wanted in mistaken_simulations.MISTAKES.items():
+    for mistake, expected in mistaken_simulations.MISTAKES.items():
         with np.errstate(all="ignore"):
             p = simulate(scene, 20, mistake)
             submission = align_submission(grader.scene, PositionSequence(path, p), 1)
@@ -493,7 +493,7 @@ def test_mistakes_on_the_published_scenes_are_named_or_reported_as_invisible(nam
         assert found is not None
         named = found.mistake.name if found.mistake else ""
         same = float(np.abs(p - simulate(scene, 20)).max()) < 1e-6 * float(np.abs(scene["V"]).max())
-        if named != wanted and wanted not in (*found.alike, *found.invisible) and not (same and not named):
+        if named != expected and expected not in (*found.alike, *found.invisible) and not (same and not named):
             wrong[mistake] = named
     assert len(wrong) <= len(mistaken_simulations.MISTAKES) // 15, wrong
 

@@ -342,14 +342,14 @@ def test_sweeps_help_lbfgs_where_springs_are_compressed(monkeypatch):
 
 def test_a_solve_by_lbfgs_alone_prepares_nothing_for_the_other_methods(monkeypatch):
     given, prepared = stiff(0.1), HybridNewton().prepare(stiff(0.1).system)
-    wanted = prepared.residual_at(given, given.current_positions)
+    expected = prepared.residual_at(given, given.current_positions)
     monkeypatch.setattr(hybrid_newton, "StepObjective", None)
     monkeypatch.setattr(hybrid_newton, "MethodChoice", None)
     found = prepared.solve(given, StopRule(50, 1e-3))
     assert found.solver_phases is not None
     assert set(found.solver_phases) == {"lbfgs"}
     assert found.termination_reason == "converged"
-    assert found.initial_residual == wanted
+    assert found.initial_residual == expected
 
 
 def test_a_solve_without_iterations_stays_at_the_guess():
@@ -616,16 +616,18 @@ def test_a_very_stiff_system_takes_gradients_from_the_objective(ratio, is_very_s
     assert (method.residual_lbfgs is None) == is_very_stiff
     run = method.start_lbfgs(step, given.initial_guess)
     run.step_state()
-    wanted = step.gradient(run.positions) if is_very_stiff else run.gradient()
-    np.testing.assert_array_equal(method.read_point(step, run).gradient, wanted)
+    expected = step.gradient(run.positions) if is_very_stiff else run.gradient()
+    np.testing.assert_array_equal(method.read_point(step, run).gradient, expected)
     solve = prepared.init_state(given, given.initial_guess)
     assert isinstance(solve, LbfgsFirstState)
     solve.step_state()
-    wanted = step.gradient(solve.positions)
+    expected = step.gradient(solve.positions)
     if is_very_stiff:
-        np.testing.assert_array_equal(solve._current_point().gradient, wanted)
+        np.testing.assert_array_equal(solve._current_point().gradient, expected)
     else:
-        np.testing.assert_allclose(solve._current_point().gradient, wanted, rtol=0.0, atol=1e-9 * np.abs(wanted).max())
+        np.testing.assert_allclose(
+            solve._current_point().gradient, expected, rtol=0.0, atol=1e-9 * np.abs(expected).max()
+        )
 
 
 def test_a_free_net_conserves_its_momentum():

@@ -80,8 +80,8 @@ def test_a_spring_retains_its_stiffness_and_its_lateral_part_is_filtered(name):
     step, at, diagonal = begin_descent(build_compressed_step())
     hessian = step.hessian(at.positions)
     assert REGULARISATION_RULES[name]().factorise_hessian(hessian, at, diagonal) == 1
-    wanted = [10.0 + FILTERS[name](lateral(length)) for length in (FIRST, SECOND)]
-    np.testing.assert_allclose(curvatures(hessian), wanted, rtol=1e-12)
+    expected = [10.0 + FILTERS[name](lateral(length)) for length in (FIRST, SECOND)]
+    np.testing.assert_allclose(curvatures(hessian), expected, rtol=1e-12)
     along = np.zeros((4, 3))
     along[[1, 3], 0] = 1.0
     np.testing.assert_allclose(hessian.solve(along)[[1, 3], 0], 1.0 / 11.0, rtol=1e-12)
@@ -95,8 +95,8 @@ def test_a_block_is_filtered_in_its_own_axes(name):
     packed = whole[:, *np.triu_indices(3)]
     by = PsdProjection(use_absolute=name == "absolute")
     out = by.project_packed(np.array([[0], [1]]), packed)
-    wanted = np.einsum("ij,mj,kj->mik", axes, FILTERS[name](known), axes)
-    np.testing.assert_allclose(out[0], wanted[0][np.triu_indices(3)], atol=1e-14)
+    expected = np.einsum("ij,mj,kj->mik", axes, FILTERS[name](known), axes)
+    np.testing.assert_allclose(out[0], expected[0][np.triu_indices(3)], atol=1e-14)
     np.testing.assert_array_equal(out[1], packed[1])
     assert (by.num_examined, by.num_projected) == (2, 1)
 
@@ -113,8 +113,8 @@ def test_pairs_of_surfaces_are_filtered_too(name):
     size = np.linalg.eigvalsh(exact.values)
     assert size.min() < -1e-3 * size.max()
     found = PsdProjection(use_absolute=name == "absolute").project_pairs(exact)
-    wanted = np.sort(FILTERS[name](size), axis=1)
-    np.testing.assert_allclose(np.linalg.eigvalsh(found.values), wanted, atol=1e-12 * size.max())
+    expected = np.sort(FILTERS[name](size), axis=1)
+    np.testing.assert_allclose(np.linalg.eigvalsh(found.values), expected, atol=1e-12 * size.max())
 
 
 def test_the_trust_region_takes_absolute_values_until_the_model_is_right():
@@ -167,12 +167,12 @@ def test_all_rules_descend_to_the_same_certified_minimum(rule, name):
         if name == "springs"
         else build_moving_problem(EFFECT_SCENES[name]())
     )
-    wanted = NewtonSolver().prepare(given.system).solve(given, StopRule(300, 1e-11))
+    expected = NewtonSolver().prepare(given.system).solve(given, StopRule(300, 1e-11))
     prepared = NewtonSolver(rule).prepare(given.system)
     found = prepared.solve(given, StopRule(300, 1e-11))
     assert found.termination_reason in ("converged", "roundoff", "stalled")
-    size = np.ptp(wanted.positions, axis=0).max()
-    np.testing.assert_allclose(found.positions, wanted.positions, atol=1e-9 * size)
+    size = np.ptp(expected.positions, axis=0).max()
+    np.testing.assert_allclose(found.positions, expected.positions, atol=1e-9 * size)
     _, at, _ = begin_descent(replace(given, initial_guess=found.positions))
     assert isinstance(prepared, PreparedDescent)
     assert prepared.method.can_terminate(StepObjective(FixedObjective(given.system), given), at)

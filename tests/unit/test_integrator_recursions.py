@@ -62,10 +62,10 @@ def test_free_flight_follows_the_methods_own_parabola(name):
     n = np.arange(STEPS + 1.0)[:, None]
     a = 2.0 * push / mass  # on each of the two vertices
     positions = np.array([p[0] for p, _ in motions(made)])
-    wanted = n * DT * np.array(velocity) + 0.5 * a * DT**2 * (n**2 + LATE.get(name, lambda n: 0.0 * n)(n))
+    expected = n * DT * np.array(velocity) + 0.5 * a * DT**2 * (n**2 + LATE.get(name, lambda n: 0.0 * n)(n))
     # A few roundings of positions of one metre in each step; weights of tableaux, of up to 8, add up some tens of them.
     more = 100.0 if name in TABLEAUX else 1.0
-    np.testing.assert_allclose(positions, made.mesh.rest_positions[0] + wanted, rtol=0, atol=more * 1e-13)
+    np.testing.assert_allclose(positions, made.mesh.rest_positions[0] + expected, rtol=0, atol=more * 1e-13)
     speeds = np.array([v[0] for _, v in motions(made)])
     np.testing.assert_allclose(speeds, np.array(velocity) + n * DT * a, rtol=0, atol=more * 1e-11)  # the same over dt
 

@@ -133,9 +133,9 @@ LOOPS = {
 
 @pytest.mark.parametrize("what", LOOPS)
 def test_a_loop_ends_by(what):
-    residuals, limits, wanted, requested = LOOPS[what]
+    residuals, limits, expected, requested = LOOPS[what]
     state = Table(*residuals)
-    np.testing.assert_equal(state.run_iterations(limits), wanted)
+    np.testing.assert_equal(state.run_iterations(limits), expected)
     assert state.asked == requested
 
 
@@ -160,14 +160,14 @@ class BatchedState(SolverState):
 
 
 def test_iterations_between_residuals_are_one_call():
-    for able, mode, batches, wanted in (
+    for able, mode, batches, expected in (
         (99, RESIDUAL_EACH, [4, 4, 2], (10, 1.0, REASON_ITERATIONS)),
         (99, RESIDUAL_LAST, [10], (10, 1.0, REASON_ITERATIONS)),
         (6, RESIDUAL_EACH, [4, 4], (6, 1.0, REASON_STALLED)),
         (6, RESIDUAL_NEVER, [10], (6, np.nan, REASON_STALLED)),
     ):
         state = BatchedState(able)
-        np.testing.assert_equal(state.run_iterations(LoopLimits(10, 0.5, 0.0, mode)), wanted)
+        np.testing.assert_equal(state.run_iterations(LoopLimits(10, 0.5, 0.0, mode)), expected)
         assert state.batches == batches
 
 
@@ -204,7 +204,7 @@ class PreparedStepping(IterativeSolver):
 
 
 @pytest.mark.parametrize(
-    ("prepared", "stop", "wanted"),
+    ("prepared", "stop", "expected"),
     [
         (PreparedStepping(0), StopRule(50, 1e-6), (20, "converged")),
         (PreparedStepping(30), StopRule(50, 1e-6), (30, "converged")),
@@ -213,9 +213,9 @@ class PreparedStepping(IterativeSolver):
         (PreparedStepping(30, most=24), StopRule(50, 1e-6), (24, "stalled")),
     ],
 )
-def test_a_close_tolerance_ends_a_solve_at_a_minimum_only(prepared, stop, wanted):
+def test_a_close_tolerance_ends_a_solve_at_a_minimum_only(prepared, stop, expected):
     solution = prepared.solve(build_first_problem(build_cloth(3)), stop)
-    assert (solution.num_iterations, solution.termination_reason) == wanted
+    assert (solution.num_iterations, solution.termination_reason) == expected
 
 
 @dataclass(frozen=True)
@@ -227,7 +227,7 @@ class PreparedNear(PreparedStepping):
 
 
 @pytest.mark.parametrize(
-    ("rests", "most", "wanted", "looks"),
+    ("rests", "most", "expected", "looks"),
     [
         (0, 90, (40, "roundoff"), [40]),
         (41, 90, (41, "roundoff"), [40, 41]),
@@ -240,7 +240,7 @@ class PreparedNear(PreparedStepping):
         (99, 43, (43, "max-iter"), [40, 41, 42, 43]),
     ],
 )
-def test_a_small_residual_is_the_floor_where_the_gradient_is_round_off(monkeypatch, rests, most, wanted, looks):
+def test_a_small_residual_is_the_floor_where_the_gradient_is_round_off(monkeypatch, rests, most, expected, looks):
     run, looked = Stepping(0, 1000), []
     monkeypatch.setattr(PreparedNear, "init_state", lambda *_: run)
     monkeypatch.setattr(
@@ -248,4 +248,4 @@ def test_a_small_residual_is_the_floor_where_the_gradient_is_round_off(monkeypat
     )
     monkeypatch.setattr(PreparedNear, "residual_at", lambda *_: 1.0)
     solution = PreparedNear(0).solve(build_first_problem(build_cloth(3)), StopRule(most, 1e-300))
-    assert ((solution.num_iterations, solution.termination_reason), looked) == (wanted, looks)
+    assert ((solution.num_iterations, solution.termination_reason), looked) == (expected, looks)

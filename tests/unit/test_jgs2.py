@@ -76,8 +76,8 @@ def test_a_response_of_the_whole_mesh_to_a_quadratic_objective_is_a_newton_step(
     springs = Springs.from_parts([e for e in HANGING.system.energies if isinstance(e, Springs)])
     soft = replace(springs, rest_length=np.zeros(len(springs.edges)))
     problem = replace(HANGING, system=replace(HANGING.system, energies=(soft,)))
-    wanted = NewtonSolver().prepare(problem.system).solve(problem, StopRule(5, 1e-12)).positions
-    np.testing.assert_allclose(first(Jgs2(neighbour_rings=8), problem), wanted, rtol=0, atol=1e-10)
+    expected = NewtonSolver().prepare(problem.system).solve(problem, StopRule(5, 1e-12)).positions
+    np.testing.assert_allclose(first(Jgs2(neighbour_rings=8), problem), expected, rtol=0, atol=1e-10)
 
 
 def first(solver: Jgs2, problem: StepProblem) -> Positions:

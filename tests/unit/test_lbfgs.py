@@ -64,10 +64,10 @@ def two_loops(
 @pytest.mark.parametrize("linear", ["supernodal", "cholespy"])
 def test_iterates_are_those_of_the_two_loop_recursion(name, pairs, linear):
     problem = PROBLEMS[name]()
-    wanted = two_loops(problem, pairs, 9)
-    values = [problem.value(p) for p in wanted]
+    expected = two_loops(problem, pairs, 9)
+    values = [problem.value(p) for p in expected]
     assert values == sorted(values, reverse=True), "the recursion needs shorter steps here"
-    for p, q in zip(islice(Lbfgs(pairs, linear).prepare(problem.system).iterates(problem), 9), wanted, strict=True):
+    for p, q in zip(islice(Lbfgs(pairs, linear).prepare(problem.system).iterates(problem), 9), expected, strict=True):
         # The same products in another order: round-off by the condition of Q, more in each iteration.
         assert np.abs(p - q).max() <= 1e-8 * np.abs(q).max()
 
@@ -87,10 +87,10 @@ def test_with_a_sparse_matrix_iterates_are_those_of_the_recursion_with_it(sweeps
     problem = build_random_problem(8, n=30, m=80)
     S = AggregatedSweeps(free_matrix(problem), sweeps).matrix.toarray()
     solver = Lbfgs(3, preconditioner="a-jacobi", jacobi_sweeps=sweeps)
-    wanted = two_loops(problem, 3, 6, S)
-    values = [problem.value(p) for p in wanted]
+    expected = two_loops(problem, 3, 6, S)
+    values = [problem.value(p) for p in expected]
     assert values == sorted(values, reverse=True), "the recursion needs shorter steps here"
-    for p, q in zip(islice(solver.prepare(problem.system).iterates(problem), 6), wanted, strict=True):
+    for p, q in zip(islice(solver.prepare(problem.system).iterates(problem), 6), expected, strict=True):
         assert np.abs(p - q).max() <= 1e-8 * np.abs(q).max()  # as above
 
 

@@ -100,9 +100,9 @@ def test_the_linearised_step_has_the_order_of_its_integrator(name, integrator, e
 
 @pytest.mark.parametrize("name", ORDERS)
 def test_pins_that_move_evenly_retain_the_order(name):
-    wanted = integrate_motion(build_unit_scene(SOFT, GravityEffect(), EVENLY, integrator="esdirk-4"), [END])
+    expected = integrate_motion(build_unit_scene(SOFT, GravityEffect(), EVENLY, integrator="esdirk-4"), [END])
     scene = build_unit_scene(SOFT, GravityEffect(), EVENLY)
-    errors = [wanted.measure_error(0, run(scene, name, refinement_factor=k)[-1].positions) for k in (24, 48)]
+    errors = [expected.measure_error(0, run(scene, name, refinement_factor=k)[-1].positions) for k in (24, 48)]
     assert np.log2(errors[0] / errors[1]) > ORDERS[name] - 0.3
 
 
@@ -123,10 +123,10 @@ def test_the_linearised_step_is_that_of_baraff_and_witkin():
     M = np.repeat(scene.system.mass, 3)
     right = dt * (f.ravel() - dt * (K @ v.ravel()))
     dv = np.linalg.solve((np.diag(M) + dt**2 * K)[np.ix_(inside, inside)], right[inside])
-    wanted = (p + dt * v).ravel()
-    wanted[inside] += dt * dv
+    expected = (p + dt * v).ravel()
+    expected[inside] += dt * dv
     found = run(scene, "baraff-witkin")[-1].positions
-    np.testing.assert_allclose(found.ravel(), wanted, rtol=0, atol=1e-13)  # round-off of positions of about 1 m
+    np.testing.assert_allclose(found.ravel(), expected, rtol=0, atol=1e-13)  # round-off of positions of about 1 m
 
 
 @pytest.mark.parametrize(

@@ -107,9 +107,9 @@ def test_every_iterate_moves_the_centre_of_mass_by_the_external_forces(backend):
     """1'A' = 0, so that springs drop out of the sum of all rows of Q p = A'K d + y, converged or not."""
     problem = build_random_problem(4, weights=())
     mass, dt = problem.system.mass, problem.system.time_step
-    wanted = mass @ problem.inertial_target + dt**2 * problem.external_force.sum(axis=0)
+    expected = mass @ problem.inertial_target + dt**2 * problem.external_force.sum(axis=0)
     for p in iterates(backend, problem, 5):
-        np.testing.assert_allclose(mass @ p, wanted, rtol=0, atol=SOLVE * mass.sum())
+        np.testing.assert_allclose(mass @ p, expected, rtol=0, atol=SOLVE * mass.sum())
 
 
 @backends
@@ -123,8 +123,8 @@ def test_springs_of_almost_no_length_have_the_same_direction_in_every_backend(ba
     problem = StepProblem(system, zero, zero, none, zero, guess, build_step_start(system, zero, zero))
     (p,) = iterates(backend, problem, 1)
     # Q^-1 A'K r e, with e the eigenvector (1, -1) of A'A: k r / (m/dt^2 + 2k).
-    wanted = 100 * 2 / (100 + 200) * (np.array([0.0, 1, 0]) if length <= ZERO_LENGTH else np.array([0.0, 0, 1]))
-    np.testing.assert_allclose(p, [-wanted, wanted], rtol=0, atol=1e-14)  # a solve with two unknowns
+    expected = 100 * 2 / (100 + 200) * (np.array([0.0, 1, 0]) if length <= ZERO_LENGTH else np.array([0.0, 0, 1]))
+    np.testing.assert_allclose(p, [-expected, expected], rtol=0, atol=1e-14)  # a solve with two unknowns
 
 
 @backends

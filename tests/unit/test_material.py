@@ -59,8 +59,8 @@ def test_a_woven_cloth_resists_by_warp_weft_and_bias():
     k = compute_spring_stiffness(mesh, scaling_rule="continuum", stretch=weave, shear=weave, bend=0.0)
     i, j = mesh.springs.T
     across, down = np.abs(mesh.rest_positions[i] - mesh.rest_positions[j])[:, [0, 2]].T > 1e-9
-    wanted = np.where(across & down, 25.0, np.where(down, 400.0, 100.0))
-    np.testing.assert_allclose(k, wanted, rtol=1e-12)
+    expected = np.where(across & down, 25.0, np.where(down, 400.0, 100.0))
+    np.testing.assert_allclose(k, expected, rtol=1e-12)
     turned = OrthotropicStiffness(warp=400.0, weft=100.0, bias=25.0, direction=(1.0, 0.0, 0.0))
     at_angles = turned.compute_stiffness(mesh, np.array([[0, 1], [0, 10], [0, 11], [0, 19], [0, 9]]))
     # At atan(1/2), cos 2 theta is 3/5: .36 of the warp, or of the weft, and .64 of the bias.

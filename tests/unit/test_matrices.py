@@ -153,9 +153,9 @@ def test_the_matrix_of_a_system_is_the_assignments_without_exact_pins(network):
     energy = Springs.from_rest_shape(np.zeros((len(mass), 3)), springs, stiffness)
     system = System(mass, time_step, (energy,), DirichletPins(pinned, mixed))
     soft = np.isfinite(mixed)
-    wanted = dense_matrices(springs, stiffness, mass, time_step, pinned[soft], weight[soft])["Q"]
+    expected = dense_matrices(springs, stiffness, mass, time_step, pinned[soft], weight[soft])["Q"]
     made = system_matrix_assembly.assemble_system_matrix(system, [energy])
-    np.testing.assert_allclose(made.toarray(), wanted, rtol=0, atol=ROUND_OFF * np.abs(wanted).max())
+    np.testing.assert_allclose(made.toarray(), expected, rtol=0, atol=ROUND_OFF * np.abs(expected).max())
     assert made.nnz == len(mass) + 2 * len(springs)
 
 

@@ -73,15 +73,15 @@ def check_against_plain(path: Path) -> None:
     made = build_local_global_matrices(scene, 1, spec.initial_guess)
     data = json.loads(path.read_text())
     V, m = scene.mesh.rest_positions, scene.system.mass
-    wanted = plain_matrices(
+    expected = plain_matrices(
         V, made.E, data["k"], m, 1 / 30, np.array(data["b"]) - 1, 1e10, np.tile([0, -9.8, 0], (len(V), 1))
     )
     rows = [data["b"].index(vertex + 1) for vertex in made.terms.pinned]
-    wanted["C"] = wanted["C"][rows]  # the order of the pins is free
-    for name, value in wanted.items():
+    expected["C"] = expected["C"][rows]  # the order of the pins is free
+    for name, value in expected.items():
         np.testing.assert_allclose(dense(getattr(made, name)), value, rtol=0, atol=ROUND_OFF * np.abs(value).max())
     for name, matrix in made.sparse_matrices.items():
-        assert matrix.nnz == np.count_nonzero(wanted[name])  # no zeros are stored
+        assert matrix.nnz == np.count_nonzero(expected[name])  # no zeros are stored
 
 
 def test_matrices_are_those_of_plain_numpy(tmp_path):

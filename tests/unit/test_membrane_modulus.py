@@ -125,10 +125,10 @@ def test_a_uniform_stretch_of_any_triangulation_has_the_energy_of_the_sheet(tmp_
     mesh = write_mesh(tmp_path, *irregular(name))
     k = compute_spring_stiffness(mesh, scaling_rule="area", stretch=500.0, shear=500.0, bend=0.0)
     e = 1e-3  # an isotropic sheet of Poisson's ratio 1/3: E / (1 - nu) e^2 for each unit of area
-    wanted = 500.0 / (1 - 1 / 3) * e**2 * mesh.surface_area
-    assert relaxed_energy(mesh, k, e * np.eye(2)) == pytest.approx(wanted, rel=EXACT)
+    expected = 500.0 / (1 - 1 / 3) * e**2 * mesh.surface_area
+    assert relaxed_energy(mesh, k, e * np.eye(2)) == pytest.approx(expected, rel=EXACT)
     constant = compute_spring_stiffness(mesh, scaling_rule="continuum", stretch=500.0, shear=500.0, bend=0.0)
-    assert abs(relaxed_energy(mesh, constant, e * np.eye(2)) / wanted - 1) > 0.03  # which is what `area` is for
+    assert abs(relaxed_energy(mesh, constant, e * np.eye(2)) / expected - 1) > 0.03  # which is what `area` is for
 
 
 @pytest.mark.parametrize("name", [name for name in TEN_MESHES if "random" in name or "moved union" in name])

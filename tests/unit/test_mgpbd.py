@@ -72,17 +72,19 @@ def test_one_spring_ends_where_its_force_is_that_of_inertia():
     start = build_step_start(system, target, rest)
     problem = StepProblem(system, target, np.zeros((2, 3)), rest[:1], rest, rest, start)
     diagonal = m / dt**2
-    wanted = (k * r + diagonal * y) / (k + diagonal)
-    np.testing.assert_allclose(solve_positions(problem, 1), [[0.0, 0.0, 0.0], [0.0, -wanted, 0.0]], rtol=0, atol=1e-15)
+    expected = (k * r + diagonal * y) / (k + diagonal)
+    np.testing.assert_allclose(
+        solve_positions(problem, 1), [[0.0, 0.0, 0.0], [0.0, -expected, 0.0]], rtol=0, atol=1e-15
+    )
 
 
 @pytest.mark.parametrize("stretch", [2.0, 2e3, 2e6])
 @pytest.mark.parametrize("factor", [1.0, 2.25], ids="c = {:g}".format)
 def test_springs_that_do_not_turn_reach_the_minimiser_of_the_step_at_once(stretch, factor):
     problem = hanging(stretch, factor)
-    wanted = CompiledLocalGlobal().prepare(problem.system).solve(problem, StopRule(50_000, 1e-14)).positions
+    expected = CompiledLocalGlobal().prepare(problem.system).solve(problem, StopRule(50_000, 1e-14)).positions
     # The first iteration is exact but for round-off, which stiff springs multiply, and the second for less.
-    np.testing.assert_allclose(solve_positions(problem, 2), wanted, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(solve_positions(problem, 2), expected, rtol=0, atol=1e-12)
 
 
 def test_springs_that_turn_in_a_step_leave_an_error_of_fourth_order_in_the_time_step():

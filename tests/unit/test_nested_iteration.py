@@ -42,9 +42,9 @@ def test_affine_motions_pass_between_meshes_without_change(tmp_path, mesh):
     fine, coarse = (build_cloth_scene(tmp_path, mesh, pins, size).mesh.rest_positions for size in (12, 5))
     rng = np.random.default_rng(0)
     turn, shift = rng.normal(size=(3, 3)), rng.normal(size=3)
-    for known, wanted in ((fine, coarse), (coarse, fine)):
-        weights = build_interpolation(known, wanted)
-        np.testing.assert_allclose(weights @ (known @ turn + shift), wanted @ turn + shift, rtol=0, atol=1e-9)
+    for known, expected in ((fine, coarse), (coarse, fine)):
+        weights = build_interpolation(known, expected)
+        np.testing.assert_allclose(weights @ (known @ turn + shift), expected @ turn + shift, rtol=0, atol=1e-9)
 
 
 def test_common_vertices_of_both_meshes_retain_their_values(tmp_path):
@@ -59,8 +59,8 @@ def test_the_guess_is_nearer_to_the_minimum_and_saves_iterations(tmp_path):
     state, ready = build_initial_state(scene), prepare(scene, Lbfgs())
     current, coarse = (build_problem(scene, state, guess) for guess in ("previous", "coarse-to-fine"))
     np.testing.assert_array_equal(coarse.initial_guess[scene.system.pins.vertices], coarse.pin_targets)
-    wanted = ready.solve(current, StopRule(2000, 1e-8)).positions
-    away = [np.abs(stated.initial_guess - wanted).max() for stated in (current, coarse)]
+    expected = ready.solve(current, StopRule(2000, 1e-8)).positions
+    away = [np.abs(stated.initial_guess - expected).max() for stated in (current, coarse)]
     assert away[1] <= 0.3 * away[0]
     first, second = (ready.solve(stated, StopRule(2000, 1e-3)) for stated in (current, coarse))
     assert first.termination_reason == second.termination_reason == "converged"

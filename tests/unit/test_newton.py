@@ -191,6 +191,6 @@ def test_all_newtons_find_the_same_minimum_of_a_taut_cloth(solver):
         GridMesh(), SpringsEffect(stretch=300.0, shear=60.0), GravityEffect(), pins, size=8, mass=50.0
     )
     given = build_first_problem(made)
-    wanted = NewtonSolver().prepare(given.system).solve(given, ENOUGH).positions
+    expected = NewtonSolver().prepare(given.system).solve(given, ENOUGH).positions
     found = solver.prepare(given.system).solve(given, ENOUGH).positions
-    np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-11)  # gradients of round-off over a stiffness of 1
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-11)  # gradients of round-off over a stiffness of 1

@@ -40,9 +40,9 @@ def test_it_finds_the_minima_of_newtons_method_alone_in_less_than_half_of_the_it
     alone.method._friction_search = None  # pyright: ignore[reportAttributeAccessIssue]
     iterations = 0
     for problem, solution in solved_steps[20:]:
-        wanted = alone.solve(problem, STOP)
-        np.testing.assert_allclose(solution.positions, wanted.positions, rtol=0, atol=1e-6)
-        iterations += wanted.num_iterations
+        expected = alone.solve(problem, STOP)
+        np.testing.assert_allclose(solution.positions, expected.positions, rtol=0, atol=1e-6)
+        iterations += expected.num_iterations
     assert 2 * sum(solution.num_iterations for _, solution in solved_steps[20:]) < iterations
 
 

@@ -111,15 +111,15 @@ def exact_hessian(problem: StepProblem, p: Positions) -> csr_array:
 @problems
 def test_the_gradient_is_that_of_the_reference_evaluator(problem):
     step, p, _ = build_step(problem)
-    wanted = problem.gradient(p)
-    np.testing.assert_allclose(step.gradient(p), wanted, rtol=0, atol=SUMS * np.abs(wanted).max(initial=1e4))
+    expected = problem.gradient(p)
+    np.testing.assert_allclose(step.gradient(p), expected, rtol=0, atol=SUMS * np.abs(expected).max(initial=1e4))
 
 
 @problems
 def test_the_objective_change_is_the_difference_of_the_reference_values(problem):
     step, p, q = build_step(problem)
-    wanted = problem.value(q) - problem.value(p)
-    assert step.objective_change(p, q)[0] == pytest.approx(wanted, rel=1e-9, abs=SUMS * problem.value_scale(p))
+    expected = problem.value(q) - problem.value(p)
+    assert step.objective_change(p, q)[0] == pytest.approx(expected, rel=1e-9, abs=SUMS * problem.value_scale(p))
 
 
 def test_the_objective_change_is_accurate_where_the_difference_of_values_has_no_digits():
@@ -143,9 +143,9 @@ def test_a_product_with_the_hessian_is_that_of_the_energies(problem):
     x[free] = np.random.default_rng(1).normal(size=(len(free), 3))
     H = exact_hessian(problem, p)
     found = step.hessian(p).matvec(x)
-    wanted = np.zeros_like(p)
-    wanted[free] = (H @ x[free].ravel()).reshape(-1, 3)
-    np.testing.assert_allclose(found, wanted, rtol=0, atol=SUMS * np.abs(wanted).max(initial=1.0))
+    expected = np.zeros_like(p)
+    expected[free] = (H @ x[free].ravel()).reshape(-1, 3)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=SUMS * np.abs(expected).max(initial=1.0))
 
 
 @problems

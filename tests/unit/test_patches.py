@@ -147,7 +147,7 @@ def test_a_displacement_from_the_same_start_reuses_its_query(clustered_mesh):
     q, r = 1.02 * p, 1.04 * p @ np.array([[0.8, 0.6, 0.0], [-0.6, 0.8, 0.0], [0.0, 0.0, 1.0]])
     patches.recent_poses.clear()
     patches.remote_clearances.clear()
-    wanted = patches.compute_clearance_bounds(p, r, limits)
+    expected = patches.compute_clearance_bounds(p, r, limits)
     patches.recent_poses.clear()
     patches.remote_clearances.clear()
     patches.compute_clearance_bounds(p, q, limits)
@@ -155,8 +155,8 @@ def test_a_displacement_from_the_same_start_reuses_its_query(clustered_mesh):
     np.testing.assert_array_equal(begin.positions[:, :3], p)
     np.testing.assert_array_equal(end.positions[:, :3], r)
     found = patches.compute_clearance_bounds(p, r, limits)
-    assert (found is None) == (wanted is None)
-    assert found is None or wanted is None or found.near_clearance == wanted.near_clearance
+    assert (found is None) == (expected is None)
+    assert found is None or expected is None or found.near_clearance == expected.near_clearance
 
 
 def test_resolved_patches_contain_no_near_pairs(clustered_mesh):
@@ -230,13 +230,13 @@ def test_boxes_leave_out_no_pair_that_comes_to_its_limits(clustered_mesh, share)
         names = {(*points.primitives[i], *triangles.primitives[j]) for i, j in one}
         names |= {frozenset((tuple(edges.primitives[i]), tuple(edges.primitives[j]))) for i, j in two}
         met = clustered_mesh.find_close_pairs(p, p + way, limits)
-        wanted, many = (
+        expected, many = (
             clustered_mesh.pairs.vertices[met].tolist(),
             int(met[: clustered_mesh.pairs.num_point_triangle].sum()),
         )
-        assert {tuple(x) for x in wanted[:many]} <= names
-        assert {frozenset((tuple(x[:2]), tuple(x[2:]))) for x in wanted[many:]} <= names
-        bound += len(wanted)
+        assert {tuple(x) for x in expected[:many]} <= names
+        assert {frozenset((tuple(x[:2]), tuple(x[2:]))) for x in expected[many:]} <= names
+        bound += len(expected)
     assert bound > 0
 
 

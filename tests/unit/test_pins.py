@@ -39,11 +39,11 @@ def test_a_penalty_pin_yields_by_the_force_on_it_over_its_weight(backend, weight
 @backends
 def test_a_penalty_becomes_an_exact_pin_in_proportion_to_its_weight(backend):
     exact = add_pins(build_random_problem(0), [0, 3], np.inf)
-    wanted = backend.prepare(exact.system).solve(exact, CONVERGED_STOP).positions
+    expected = backend.prepare(exact.system).solve(exact, CONVERGED_STOP).positions
     away = []
     for weight in (1e6, 1e7, 1e8):
         soft = add_pins(build_random_problem(0), [0, 3], weight)
-        away.append(np.abs(backend.prepare(soft.system).solve(soft, CONVERGED_STOP).positions - wanted).max())
+        away.append(np.abs(backend.prepare(soft.system).solve(soft, CONVERGED_STOP).positions - expected).max())
     # 1/w is the leading term; the next is smaller by stiffness / weight, at most 1e4 / 1e6.
     np.testing.assert_allclose([away[0] / away[1], away[1] / away[2]], 10.0, rtol=0.02)
 

@@ -78,8 +78,8 @@ def test_schwarz_is_the_sum_of_its_levels(size, levels):
     assert len(S.subdomain_inverses) == levels
     np.testing.assert_array_equal(np.sort(order), np.arange(len(order)))
     b = np.random.default_rng(1).normal(size=(len(order), 3))
-    wanted = by_levels(A, order, b.reshape(-1, 1)).reshape(-1, 3)
-    np.testing.assert_allclose(S.apply_preconditioner(b), wanted, rtol=0, atol=1e-10 * np.abs(wanted).max())
+    expected = by_levels(A, order, b.reshape(-1, 1)).reshape(-1, 3)
+    np.testing.assert_allclose(S.apply_preconditioner(b), expected, rtol=0, atol=1e-10 * np.abs(expected).max())
 
 
 def whole(S: AdditiveSchwarz, f: int) -> NDArray[np.float64]:
@@ -129,9 +129,9 @@ def test_diagonal_blocks_are_those_of_the_clamped_matrix(scene):
     p = step.apply_exact_pins(stated.current_positions)
     hessian = step.hessian(p)
     matrix = hessian.assemble_clamped()
-    wanted = matrix.values[matrix.block_indices.diagonal_block[stated.system.free_vertices]]
+    expected = matrix.values[matrix.block_indices.diagonal_block[stated.system.free_vertices]]
     np.testing.assert_allclose(
-        assemble_diagonal_blocks(step, hessian, p), wanted, rtol=0, atol=1e-12 * np.abs(wanted).max()
+        assemble_diagonal_blocks(step, hessian, p), expected, rtol=0, atol=1e-12 * np.abs(expected).max()
     )
 
 
@@ -139,10 +139,10 @@ def test_diagonal_blocks_are_those_of_the_clamped_matrix(scene):
 @pytest.mark.parametrize("method", METHODS)
 def test_the_minimum_is_that_of_newtons_method(method, name):
     stated = build_effect_step("all that are projective")
-    wanted = NewtonSolver().prepare(stated.system).solve(stated, StopRule(200)).positions
+    expected = NewtonSolver().prepare(stated.system).solve(stated, StopRule(200)).positions
     solution = METHODS[method](preconditioner=name).prepare(stated.system).solve(stated, StopRule(3000, 1e-9))
     assert solution.termination_reason != "max-iter"
-    np.testing.assert_allclose(solution.positions, wanted, rtol=0, atol=1e-7)
+    np.testing.assert_allclose(solution.positions, expected, rtol=0, atol=1e-7)
 
 
 @others

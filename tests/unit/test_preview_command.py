@@ -41,8 +41,8 @@ def test_the_chosen_settings_are_printed_and_drawn(tmp_path: Path):
     hue = pixels - pixels.mean(axis=2, keepdims=True)
     for k in range(3):  # lit from one side, so lighter and darker: by its hue
         colour = np.array(to_rgb(build_indexed_style(k).color))
-        wanted = colour - colour.mean()
-        alike = (hue @ wanted) / np.maximum(np.linalg.norm(hue, axis=2) * np.linalg.norm(wanted), 1e-9)
+        expected = colour - colour.mean()
+        alike = (hue @ expected) / np.maximum(np.linalg.norm(hue, axis=2) * np.linalg.norm(expected), 1e-9)
         assert int(((alike > 0.98) & (np.linalg.norm(hue, axis=2) > 0.3)).sum()) > 100
 
 

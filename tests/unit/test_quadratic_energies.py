@@ -89,12 +89,12 @@ def test_forces_and_differences_of_value_are_those_of_the_energies(name, field):
             energy.add_gradient(x, out)
         return out
 
-    wanted = sum(energy.value(q) - energy.value(p) for energy in forms)
+    expected = sum(energy.value(q) - energy.value(p) for energy in forms)
     size = sum(abs(energy.value(x)) for energy in forms for x in (p, q)) + np.abs(force).sum()
-    assert abs(value(q) - value(p) - wanted) <= 1e-12 * size  # sums of some hundred terms
+    assert abs(value(q) - value(p) - expected) <= 1e-12 * size  # sums of some hundred terms
     found = gradient([whole], p) - gradient([parts.springs], p) + parts.vertex_weight[:, None] * p - force
-    wanted = gradient(forms, p)
-    np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-12 * (np.abs(wanted).max() + np.abs(force).max()))
+    expected = gradient(forms, p)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12 * (np.abs(expected).max() + np.abs(force).max()))
 
 
 def test_a_spring_and_a_pair_between_the_same_vertices_are_one():
@@ -110,10 +110,10 @@ def test_edges_in_the_norm_of_q_are_one_with_the_springs_between_the_same_vertic
     system = build_effect_cloth(STRAIN_LIMIT_EFFECT, DASHPOT_EFFECT, RAYLEIGH_EFFECT).system
     parts, n = decompose_energies(system), system.num_vertices
     assert len(parts.system_pairs.edges) == len(parts.springs.edges)
-    wanted = csr_array((n, n))
+    expected = csr_array((n, n))
     for energy in (parts.springs, *parts.strain_limits, *parts.dashpots):
-        wanted = wanted + energy.stiffness_matrix(n)
-    assert abs(parts.system_pairs.stiffness_matrix(n) - wanted).max() <= 1e-12 * wanted.max()
+        expected = expected + energy.stiffness_matrix(n)
+    assert abs(parts.system_pairs.stiffness_matrix(n) - expected).max() <= 1e-12 * expected.max()
 
 
 def test_a_negative_energy_of_a_packet_is_no_short_spring():
@@ -138,23 +138,23 @@ def test_compiled_iterates_are_those_of_the_sparse_backend(name, linear):
     problem = build_moving_problem(SCENES[name]())
     solver = CompiledLocalGlobal(linear)
     assert isinstance(solver.prepare(problem.system), PreparedCompiledLocalGlobal)
-    wanted, found = (iterates(one, problem, 20)[-1] for one in (SparseLocalGlobal(), solver))
+    expected, found = (iterates(one, problem, 20)[-1] for one in (SparseLocalGlobal(), solver))
     # Solves with pins of 1e10 N/m among some hundred lose as many of sixteen digits at worst.
-    np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9)
 
 
 @scenes
 @pytest.mark.parametrize("precision", ["float32", "float16"])
 def test_less_precise_factors_end_where_float64_ends_and_descend(name, precision):
     problem = build_moving_problem(SCENES[name]())
-    wanted = iterates(CompiledLocalGlobal(), problem, 6000)[-1]
+    expected = iterates(CompiledLocalGlobal(), problem, 6000)[-1]
     prepared = CompiledLocalGlobal("supernodal", precision).prepare(problem.system)
     value = problem.value(problem.initial_guess)
     for p in islice(prepared.iterates(problem), 40):
         before, value = value, problem.value(p)
         assert value <= before + 1e-13 * problem.value_scale(p)  # a hundred terms
     found = prepared.solve(problem, StopRule(6000)).positions
-    np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-9)  # what rates of convergence leave
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9)  # what rates of convergence leave
 
 
 @scenes
@@ -168,12 +168,12 @@ def test_a_compiled_step_is_the_step_with_calls_in_between(name):
 @scenes
 def test_residuals_are_those_of_the_sparse_backend(name):
     problem = build_moving_problem(SCENES[name]())
-    found, wanted = (
+    found, expected = (
         s.prepare(problem.system).solve(problem, StopRule(12, 1e-15))
         for s in (CompiledLocalGlobal(), SparseLocalGlobal())
     )
-    assert found.residual == pytest.approx(wanted.residual, rel=1e-6)  # half of the digits, of squares of differences
-    assert found.initial_residual == pytest.approx(wanted.initial_residual, rel=1e-6)
+    assert found.residual == pytest.approx(expected.residual, rel=1e-6)  # half of the digits, of squares of differences
+    assert found.initial_residual == pytest.approx(expected.initial_residual, rel=1e-6)
 
 
 def test_other_energies_are_named():
@@ -210,5 +210,5 @@ def test_where_a_form_and_a_spring_cancel_in_q_the_step_is_not_compiled_and_righ
     assert decompose_energies(problem.system).has_cancellation
     solver = CompiledLocalGlobal()
     assert not isinstance(solver.prepare(problem.system), PreparedCompiledLocalGlobal)
-    wanted, found = (iterates(one, problem, 30)[-1] for one in (SparseLocalGlobal(), solver))
-    np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-12)  # a solve with three unknowns
+    expected, found = (iterates(one, problem, 30)[-1] for one in (SparseLocalGlobal(), solver))
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)  # a solve with three unknowns

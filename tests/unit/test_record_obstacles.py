@@ -84,8 +84,8 @@ def test_moving_obstacles_have_a_transform_in_each_frame_and_resting_ones_none(r
         np.array(m).reshape(3, 3).T @ OBSTACLES[0].center + t
         for (m,), (t,) in zip([v for v in moved["mat3x3"] if v], [v for v in moved["translation"] if v], strict=True)
     ]
-    wanted = [RISES.transform_points(np.array([OBSTACLES[0].center]), k * TIME_STEP)[0] for k in range(11)]
-    np.testing.assert_allclose(centers, wanted, atol=1e-5)  # float32, of positions of some metres
+    expected = [RISES.transform_points(np.array([OBSTACLES[0].center]), k * TIME_STEP)[0] for k in range(11)]
+    np.testing.assert_allclose(centers, expected, atol=1e-5)  # float32, of positions of some metres
 
 
 def test_pictures_see_the_obstacles_where_they_are(recording_path: Path):

@@ -101,8 +101,8 @@ def test_a_sweep_lives_at_a_url(config: Path, cache: Path, tmp_path: Path):
 @pytest.fixture
 def storage(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     """An S3-compatible server on the loopback, with a bucket."""
-    wanted = "a server of this kind: pip install -e '.[s3-server]'"
-    moto, boto3 = (pytest.importorskip(name, reason=wanted) for name in ("moto.server", "boto3"))
+    expected = "a server of this kind: pip install -e '.[s3-server]'"
+    moto, boto3 = (pytest.importorskip(name, reason=expected) for name in ("moto.server", "boto3"))
     server = moto.ThreadedMotoServer("127.0.0.1", 0)
     server.start()
     host, port = server.get_host_and_port()

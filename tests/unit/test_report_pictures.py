@@ -342,8 +342,8 @@ def test_vertices_far_from_the_others_are_not_framed(vertices: slice, metres: fl
     assert np.flatnonzero(~found).tolist() == list(range(36))[vertices][:count]
     points = points_to_frame(replay, range(8))
     assert (np.ptp(points, axis=0).max() < 3.0) == (count > 0 or metres < 2.0)
-    wanted = {0: [], 1: ["1 of 36 vertices is outside"]}.get(count, [f"{count} of 36 vertices are outside"])
-    assert describe_outside(found) == wanted
+    expected = {0: [], 1: ["1 of 36 vertices is outside"]}.get(count, [f"{count} of 36 vertices are outside"])
+    assert describe_outside(found) == expected
 
 
 SURFACES = {
@@ -353,8 +353,8 @@ SURFACES = {
 }
 
 
-@pytest.mark.parametrize(("apart", "folded", "wanted"), SURFACES.values(), ids=SURFACES)
-def test_a_picture_states_that_a_surface_has_no_self_contact(apart: bool, folded: float, wanted: list[str]) -> None:
+@pytest.mark.parametrize(("apart", "folded", "expected"), SURFACES.values(), ids=SURFACES)
+def test_a_picture_states_that_a_surface_has_no_self_contact(apart: bool, folded: float, expected: list[str]) -> None:
     """Folded: one corner of the cloth is pushed through its middle."""
     plain = cloth()
     positions = plain.positions.copy()
@@ -363,7 +363,7 @@ def test_a_picture_states_that_a_surface_has_no_self_contact(apart: bool, folded
     replay = replace(plain, positions=positions, properties={**plain.properties, "prevents_self_intersection": apart})
     if not folded:
         replay = replace(replay, positions=plain.positions)
-    assert describe_self_intersection(replay, [0, 7]) == wanted
+    assert describe_self_intersection(replay, [0, 7]) == expected
     assert apart or describe_self_intersection(replay, [0]) == ["no self-contact"]
     assert describe_self_intersection(plain, [7]) == [], "a recording that does not say is not judged"
     net = replace(replay, triangles=replay.triangles[:0])

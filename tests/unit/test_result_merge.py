@@ -79,9 +79,9 @@ def test_folders_that_look_like_columns_or_patterns_are_merged_as_all_are(two: P
         (two / name).rename(two / other)
     merge_results([two / "size=64", two / "solver=x[1]"], two / "status=failed", lambda line: None)
     found = parquet_rows.read_rows_by_file(row_store.list_units(two / "status=failed" / "sweep" / "rows"))
-    wanted = [row for number in range(5) for row in build_dummy_rows(number)]
+    expected = [row for number in range(5) for row in build_dummy_rows(number)]
     for name in ("run_id", "size", "solver", "status"):
-        assert found[name].to_pylist() == [row[name] for row in wanted]
+        assert found[name].to_pylist() == [row[name] for row in expected]
 
 
 def test_rows_that_are_not_written_as_they_were_replace_nothing(two: Path, monkeypatch: pytest.MonkeyPatch):

@@ -165,11 +165,11 @@ def test_candidates_are_all_that_are_near():
     contact, p, triangles = build_touching_sheets()
     surface, reach = contact.collision_mesh, 2 * contact.activation_distance
     edges = unique_edges(triangles)
-    wanted = [(i, *t) for i in range(len(p)) for t in triangles.tolist() if i not in t]
-    wanted += [(*e, *f) for e, f in combinations(edges.tolist(), 2) if not set(e) & set(f)]
+    expected = [(i, *t) for i in range(len(p)) for t in triangles.tolist() if i not in t]
+    expected += [(*e, *f) for e, f in combinations(edges.tolist(), 2) if not set(e) & set(f)]
     first = sum(1 for _ in range(len(p)) for _ in triangles) - 3 * len(triangles)
-    one = np.ones(len(wanted))
-    every = Candidates(np.array(wanted), first, one, one, 0 * one, CONTACT_THICKNESS, CONTACT_DHAT)
+    one = np.ones(len(expected))
+    every = Candidates(np.array(expected), first, one, one, 0 * one, CONTACT_THICKNESS, CONTACT_DHAT)
     near = compute_distances(every, p) < reach
     found = surface.find_proximity_candidates(p, reach)
     assert name_pairs(found.vertices, found.num_point_triangle) == name_pairs(

@@ -140,9 +140,9 @@ def test_filters_change_the_velocity_before_inertia_and_forces_see_it():
         SCENE, varying_forces=(force,), velocity_filters=(lambda v: 0.5 * v, lambda v: v + np.array([1.0, 0.0, 0.0]))
     )
     stated = build_problem(made, STATE, "previous")
-    wanted = 0.5 * NOW.velocity + [1.0, 0.0, 0.0]  # in the order of the effects
-    np.testing.assert_allclose(stated.inertial_target, NOW.positions + DT * wanted, rtol=1e-14)
-    np.testing.assert_allclose(seen[0], wanted, rtol=1e-14)
+    expected = 0.5 * NOW.velocity + [1.0, 0.0, 0.0]  # in the order of the effects
+    np.testing.assert_allclose(stated.inertial_target, NOW.positions + DT * expected, rtol=1e-14)
+    np.testing.assert_allclose(seen[0], expected, rtol=1e-14)
 
 
 def test_each_step_starts_from_the_two_before_it():
@@ -198,8 +198,8 @@ def test_ether_drag_slows_a_free_particle_exponentially(rate):
     p = simulate_trajectory(made, LOCAL_GLOBAL_BACKENDS[0], 12)
     moved = np.diff(np.concatenate([made.mesh.rest_positions[None], p]), axis=0)
     decay = np.exp(-rate * DT * np.arange(1, 13))
-    wanted = DT * decay[:, None, None] * np.tile(VELOCITY, (2, 1))
-    np.testing.assert_allclose(moved, wanted, rtol=0, atol=1e-14)  # differences of positions of order one
+    expected = DT * decay[:, None, None] * np.tile(VELOCITY, (2, 1))
+    np.testing.assert_allclose(moved, expected, rtol=0, atol=1e-14)  # differences of positions of order one
 
 
 def test_a_force_acts_once_a_step():
@@ -207,5 +207,5 @@ def test_a_force_acts_once_a_step():
     made = build_test_scene(ChainMesh(), ConstantForceEffect(force=(3.0, 0.0, 0.0)), size=2, mass=2.0, time_step=DT)
     p = simulate_trajectory(made, LOCAL_GLOBAL_BACKENDS[1], 10)
     n = np.arange(1, 11)
-    wanted = made.mesh.rest_positions[:, 0] + (3.0 * DT**2 * n * (n + 1) / 2)[:, None]
-    np.testing.assert_allclose(p[:, :, 0], wanted, rtol=1e-13)
+    expected = made.mesh.rest_positions[:, 0] + (3.0 * DT**2 * n * (n + 1) / 2)[:, None]
+    np.testing.assert_allclose(p[:, :, 0], expected, rtol=1e-13)

@@ -57,8 +57,8 @@ def test_a_prism_in_self_stress_stays_at_rest(solver: str):
     scene, p = simulate_network("tensegrity-prism", 60, solver)
     # A force of 241 N has a round-off of 3e-14 N; accumulated over 60 steps of a prism of 1 kg it moves it by 1e-12 m.
     np.testing.assert_allclose(p, scene.mesh.rest_positions, rtol=0, atol=2e-12)
-    wanted = np.repeat([-240.81192050387907, 86.60254037844386, 178.9123219435526], [3, 6, 3])
-    np.testing.assert_allclose(compute_tensions(scene, p), wanted, rtol=1e-9)
+    expected = np.repeat([-240.81192050387907, 86.60254037844386, 178.9123219435526], [3, 6, 3])
+    np.testing.assert_allclose(compute_tensions(scene, p), expected, rtol=1e-9)
 
 
 def test_a_cable_net_returns_to_the_shape_that_the_force_density_method_finds():
@@ -105,8 +105,8 @@ def solve_discrete_catenary(num_springs: int, span: float = 8.0) -> tuple[float,
 
 def test_a_slack_cable_falls_into_the_elastic_catenary():
     scene, p = simulate_network("elastic-catenary", 150, time_step=0.1)
-    horizontal, wanted = solve_discrete_catenary(20)
-    np.testing.assert_allclose(p, wanted, rtol=0, atol=1e-6)
+    horizontal, expected = solve_discrete_catenary(20)
+    np.testing.assert_allclose(p, expected, rtol=0, atol=1e-6)
     tension = compute_tensions(scene, p)
     known = [np.hypot(horizontal, 98.1 / 40), 56.0284137303]
     np.testing.assert_allclose([tension.min(), tension.max()], known, rtol=1e-4)

@@ -94,8 +94,8 @@ def test_the_stiffness_bounds_the_hessian(seed, squeeze):
 @given(seeds)
 def test_the_gradient_is_the_stiffness_times_the_positions_less_the_projection(seed):
     _, springs, p = network(seed)
-    wanted = springs.stiffness_matrix(len(p)) @ p - projection(springs, p)
-    np.testing.assert_allclose(gradient(springs, p), wanted, rtol=0, atol=ROUND_OFF * np.abs(wanted).max())
+    expected = springs.stiffness_matrix(len(p)) @ p - projection(springs, p)
+    np.testing.assert_allclose(gradient(springs, p), expected, rtol=0, atol=ROUND_OFF * np.abs(expected).max())
 
 
 @given(seeds)
@@ -185,14 +185,14 @@ def test_a_spring_of_no_rest_length_is_quadratic_everywhere(length):
     springs, p = single(rest_length=0.0, length=length)
     assert springs.value(p) == pytest.approx(5 * length**2)
     np.testing.assert_allclose(gradient(springs, p), [10 * length * X, -10 * length * X])
-    wanted = np.kron([[10.0, -10.0], [-10.0, 10.0]], np.eye(3))
-    np.testing.assert_allclose(springs.hessian(p).toarray(), wanted, rtol=ROUND_OFF)
+    expected = np.kron([[10.0, -10.0], [-10.0, 10.0]], np.eye(3))
+    np.testing.assert_allclose(springs.hessian(p).toarray(), expected, rtol=ROUND_OFF)
 
 
 def test_a_spring_of_zero_length_has_curvature_along_its_direction_alone():
     springs, p = single(rest_length=1.0, length=0.0)
-    wanted = np.kron([[10.0, -10.0], [-10.0, 10.0]], np.outer(X, X))
-    np.testing.assert_array_equal(springs.hessian(p).toarray(), wanted)
+    expected = np.kron([[10.0, -10.0], [-10.0, 10.0]], np.outer(X, X))
+    np.testing.assert_array_equal(springs.hessian(p).toarray(), expected)
 
 
 def test_a_loop_stores_nothing_and_pulls_nowhere():

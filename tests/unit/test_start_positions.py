@@ -28,7 +28,7 @@ def positions(**keys) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    ("keys", "wanted"),
+    ("keys", "expected"),
     [
         ({"kind": "rest"}, REST),
         ({"kind": "collapsed"}, [MEAN] * 4),
@@ -40,8 +40,8 @@ def positions(**keys) -> np.ndarray:
     ],
     ids=lambda value: value["kind"] if isinstance(value, dict) else "",
 )
-def test_a_start_is_that_of_its_kind(keys, wanted):
-    np.testing.assert_array_equal(positions(**keys), wanted)
+def test_a_start_is_that_of_its_kind(keys, expected):
+    np.testing.assert_array_equal(positions(**keys), expected)
 
 
 def test_random_starts_fill_their_cube_and_follow_their_seed():

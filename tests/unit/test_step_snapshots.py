@@ -161,7 +161,7 @@ def test_the_peak_snapshot_is_the_step_with_the_largest_initial_gap():
 
 
 @pytest.mark.parametrize(
-    ("objective_decrease", "wanted"),
+    ("objective_decrease", "expected"),
     [
         ([1.0, 0.0, 0.0, 3.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0], (2, 6, 4)),
         ([9.0, 1.0, 2.0], (2, 2, 3)),  # BDF2 takes its first step by another method
@@ -169,8 +169,8 @@ def test_the_peak_snapshot_is_the_step_with_the_largest_initial_gap():
         (np.arange(60.0), (6, 30, 60)),
     ],
 )
-def test_snapshots_are_at_a_tenth_and_a_half_of_the_run_and_at_its_peak(objective_decrease, wanted):
-    assert tuple(select_snapshot_frames(np.array(objective_decrease), len(objective_decrease)).values()) == wanted
+def test_snapshots_are_at_a_tenth_and_a_half_of_the_run_and_at_its_peak(objective_decrease, expected):
+    assert tuple(select_snapshot_frames(np.array(objective_decrease), len(objective_decrease)).values()) == expected
 
 
 CHANGES = {

@@ -146,8 +146,8 @@ def test_the_residual_leaves_pinned_vertices_out(backend):
     springs = require_only_springs(problem.system, "the test")
     A = e[springs.edges[:, 0]] - e[springs.edges[:, 1]]
     inertia = problem.system.mass / problem.system.time_step**2 @ np.sum(e**2, axis=1)
-    wanted = np.sqrt(inertia + springs.stiffness @ np.sum(A**2, axis=1))
-    assert solution.residual == pytest.approx(wanted, rel=HALF_THE_DIGITS)
+    expected = np.sqrt(inertia + springs.stiffness @ np.sum(A**2, axis=1))
+    assert solution.residual == pytest.approx(expected, rel=HALF_THE_DIGITS)
 
 
 @backends
@@ -189,9 +189,9 @@ def test_a_chain_falls_whatever_the_limits_that_it_does_not_reach(case: str):
     problem = hard(case)
     solution = NewtonSolver().prepare(problem.system).solve(problem, StopRule(300, 1e-14))
     free = replace(problem, system=replace(problem.system, energies=problem.system.energies[:1]))
-    wanted = NewtonSolver().prepare(free.system).solve(free, StopRule(300, 1e-14)).positions
+    expected = NewtonSolver().prepare(free.system).solve(free, StopRule(300, 1e-14)).positions
     fall = problem.value(solution.positions) - problem.value(problem.current_positions)
-    assert fall == pytest.approx(problem.value(wanted) - problem.value(problem.current_positions), rel=1e-9)
+    assert fall == pytest.approx(problem.value(expected) - problem.value(problem.current_positions), rel=1e-9)
 
 
 @pytest.mark.parametrize("method", [SparseLocalGlobal(), Lbfgs()], ids=lambda method: type(method).__name__)

@@ -260,8 +260,8 @@ def test_a_mesh_from_a_file_is_identified_by_its_contents(tmp_path):
     (tmp_path / "one.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 0 1\nf 1 3 2\n")
     (read,) = parse_obstacles(build_obstacles_property([one])["obstacles"])
     assert isinstance(read, MeshObstacle)
-    for found, wanted in zip(read.build_surface(), one.build_surface(), strict=True):
-        np.testing.assert_array_equal(found, wanted)
+    for found, expected in zip(read.build_surface(), one.build_surface(), strict=True):
+        np.testing.assert_array_equal(found, expected)
     np.testing.assert_array_equal(read.build_surface()[0][1], [2.0, -1.0, 0.0])
     with pytest.raises(ValueError, match=r"there is no file .*two\.obj"):
         MeshObstacle.model_validate(given | {"mesh": {"kind": "file", "path": "two.obj"}}, context=context)
@@ -304,11 +304,11 @@ def test_it_slides_above_the_angle_of_friction_and_rests_below_within_a_twentiet
     rests, _ = slide(0.95 * MU)
     assert rests[-1] < 1e-3  # the creep
     for steeper in (1.05, 1.5):
-        slides, wanted = slide(steeper * MU)
+        slides, expected = slide(steeper * MU)
         assert slides[-1] > 10e-3
         # The plane is two triangles: near their common side normal forces lean, and friction is off by up to 1 %.
         friction = MU * 9.81 * np.cos(np.arctan(steeper * MU))
-        assert (slides[-1] - slides[39]) / (40 * DT) == pytest.approx(wanted, abs=0.01 * friction)
+        assert (slides[-1] - slides[39]) / (40 * DT) == pytest.approx(expected, abs=0.01 * friction)
 
 
 def test_sheets_that_collide_with_friction_conserve_momentum():

@@ -92,8 +92,8 @@ def test_a_mass_on_a_spring_follows_its_recurrence_and_its_period_is_of_second_o
 def test_the_error_of_a_swing_is_of_first_order_in_the_substep():
     made, omega = spring(time_step=0.05)
     velocity = np.array([[0.0, 0.0, 0.0], [0.0, -0.3, 0.0]])
-    wanted = -0.3 * np.cos(omega * 0.05)
-    errors = [abs(motions(made, velocity, 1, k)[-1].velocity[1, 1] - wanted) for k in (64, 128, 256)]
+    expected = -0.3 * np.cos(omega * 0.05)
+    errors = [abs(motions(made, velocity, 1, k)[-1].velocity[1, 1] - expected) for k in (64, 128, 256)]
     np.testing.assert_allclose([a / b for a, b in pairwise(errors)], 2.0, rtol=0.03)  # the next order
 
 

@@ -80,12 +80,12 @@ ALONG = {  # the place of the second vertex of two along x, each of 1 kg, less 1
 
 @pytest.mark.parametrize("case", ALONG)
 def test_a_mass_on_a_line_follows_the_closed_form_of_its_equation(case):
-    effects, velocity, wanted = ALONG[case]
+    effects, velocity, expected = ALONG[case]
     found = integrate_motion(build_unit_scene(ChainMesh(), *effects, size=2, velocity=velocity), TIMES)
     # rtol 1e-12 a step, some hundred steps. A dashpot feels the pin's start, which is rounded over 1e-5 s: the impulse
     # of half of its pull in that time is 3e-6 N s.
     atol = 3e-6 if "dashpot whose" in case else 1e-11
-    np.testing.assert_allclose(found.positions[:, 1, 0] - 1.0, wanted(np.array(TIMES)), rtol=0, atol=atol)
+    np.testing.assert_allclose(found.positions[:, 1, 0] - 1.0, expected(np.array(TIMES)), rtol=0, atol=atol)
     assert found.disagreement.max() < 1e-8
     found.require_accuracy(1e-6)
 
@@ -123,8 +123,8 @@ def test_the_acceleration_is_the_force_of_the_scene_over_the_mass():
         force = scene.constant_force + sum(f(p, v, 0.7) for f in scene.varying_forces)
         gradient = np.zeros_like(p)
         scene.all_springs.add_gradient(p, gradient)
-        wanted = np.concatenate([v[free].ravel(), ((force - gradient) / m)[free].ravel()])
-        np.testing.assert_allclose(field(0.7, y), wanted, rtol=1e-12, atol=1e-10)  # sums of terms of some hundred
+        expected = np.concatenate([v[free].ravel(), ((force - gradient) / m)[free].ravel()])
+        np.testing.assert_allclose(field(0.7, y), expected, rtol=1e-12, atol=1e-10)  # sums of terms of some hundred
 
 
 PINNED_CORNERS = PinsEffect(parts=("corners",))
@@ -144,13 +144,13 @@ def test_the_assignments_scenes_have_the_known_errors_of_time_stepping(name):
     scene = load_scene(SHARED_SCENES / f"{name}.json")
     truth = integrate_motion(build_exact_scene(scene, 0), [1.0])
     truth.require_accuracy(1e-3)
-    for integrator, wanted in KNOWN_ERRORS[name].items():
+    for integrator, expected in KNOWN_ERRORS[name].items():
         run = build_exact_scene(scene, 0, integrator)
         *_, last = simulate_scene(
             run, prepare(run, NewtonSolver()), StopRule(100, 1e-12), initial_guess="previous", frames=30
         )
         # All three digits that are stated.
-        assert truth.measure_error(0, last.positions) == pytest.approx(wanted, rel=0.025)
+        assert truth.measure_error(0, last.positions) == pytest.approx(expected, rel=0.025)
 
 
 CHAOS = spec(

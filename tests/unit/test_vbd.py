@@ -45,10 +45,10 @@ def iterates(method, problem: StepProblem, count: int) -> list[np.ndarray]:
 def test_it_ends_at_the_minimiser_of_local_global(method, problem, factor):
     problem = replace(problem, system=replace(problem.system, inertia_factor=factor))
     # Near the minimiser, where the objective is convex: from far away they may choose other valleys.
-    wanted = CompiledLocalGlobal().prepare(problem.system).solve(problem, StopRule(30_000, 1e-13)).positions
-    near = replace(problem, initial_guess=wanted + 1e-3 * np.random.default_rng(0).normal(size=wanted.shape))
+    expected = CompiledLocalGlobal().prepare(problem.system).solve(problem, StopRule(30_000, 1e-13)).positions
+    near = replace(problem, initial_guess=expected + 1e-3 * np.random.default_rng(0).normal(size=expected.shape))
     found = method.prepare(problem.system).solve(near, StopRule(4000)).positions
-    np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-9)  # what local-global's rate leaves at its tolerance
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9)  # what local-global's rate leaves at its tolerance
 
 
 STARTS = {
