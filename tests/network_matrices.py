@@ -22,10 +22,10 @@ def grid_springs(*shape: int) -> np.ndarray:
     index = np.arange(np.prod(shape)).reshape(shape)
     ends = []
     for step in np.ndindex(*(3,) * len(shape)):
-        way = tuple(k - 1 for k in step)
-        if way > (0,) * len(shape):
+        offset = tuple(k - 1 for k in step)
+        if offset > (0,) * len(shape):
             a, b = (index[tuple(slice(max(0, -s), n - max(0, s)) for s, n in zip(w, shape, strict=True))]
-                    for w in (way, tuple(-s for s in way)))  # fmt: skip
+                    for w in (offset, tuple(-s for s in offset)))  # fmt: skip
             ends.append(np.stack([a.ravel(), b.ravel()], axis=1))
     return np.concatenate(ends)
 

@@ -60,8 +60,8 @@ def test_a_path_next_to_a_ball_is_intersection_free(motion: KeyFrameMotion | Non
 @pytest.mark.parametrize("motion", [ACROSS, ROUND, SMOOTH])
 def test_no_point_is_faster_than_the_bound(motion: KeyFrameMotion):
     times = np.linspace(0.0, 1.0, 1001)
-    way = np.array([motion.transform_points(POINT, t)[0] for t in times])
-    fastest = np.linalg.norm(np.diff(way, axis=0), axis=1).max() / times[1]
+    path = np.array([motion.transform_points(POINT, t)[0] for t in times])
+    fastest = np.linalg.norm(np.diff(path, axis=0), axis=1).max() / times[1]
     assert fastest <= motion.bound_speed(0.0, 1.0, POINT) * (1 + 1e-9)  # round-off of differences of 1e-3
 
 

@@ -146,11 +146,11 @@ def test_clearances_are_the_smallest_gaps_of_all_pairs():
 def displace_vertices(seed: int, p: Positions, bound: np.ndarray, share: float) -> Positions:
     """Each vertex displaced by a share of its bound: at random, or up and down towards the other sheet."""
     rng = np.random.default_rng(seed)
-    way = rng.normal(size=p.shape)
+    direction = rng.normal(size=p.shape)
     if seed % 2:
-        way = np.zeros_like(p)
-        way[:, 1] = np.where(np.arange(len(p)) < len(p) // 2, 1.0, -1.0)
-    return p + share * bound[:, None] * way / np.linalg.norm(way, axis=1)[:, None]
+        direction = np.zeros_like(p)
+        direction[:, 1] = np.where(np.arange(len(p)) < len(p) // 2, 1.0, -1.0)
+    return p + share * bound[:, None] * direction / np.linalg.norm(direction, axis=1)[:, None]
 
 
 def test_triangles_without_edges_have_an_adjacency():

@@ -199,8 +199,8 @@ def test_what_is_near_at_rest_moves_relative_to_itself_by_at_most_the_max_relati
             deform_positions(clustered_mesh.rest_positions, seed),
             deform_positions(clustered_mesh.rest_positions, 50 + seed),
         )
-        way = q - p
-        other = np.linalg.norm(way[near[:, :, None]] - way[near[:, None, :]], axis=-1).max()
+        displacement = q - p
+        other = np.linalg.norm(displacement[near[:, :, None]] - displacement[near[:, None, :]], axis=-1).max()
         found = clustered_mesh.patches.max_relative_displacement(p, q)
         assert other <= found <= max_relative_displacement(p, q) * (1.0 + 1e-12)
         assert clustered_mesh.patches.max_relative_displacement(p, p + 3.0) <= 1e-14
@@ -218,18 +218,18 @@ def build_displacements(p: Positions) -> list[Positions]:
 def test_boxes_leave_out_no_pair_that_comes_to_its_limits(clustered_mesh, share):
     points, edges, triangles = clustered_mesh.trees
     p, bound = 0.3 * deform_positions(clustered_mesh.rest_positions, 504), 0
-    for way in build_displacements(p):
+    for displacement in build_displacements(p):
         limits = CollisionQuery(
-            0.5 * INFLATION_RADIUS, 0.2 * INFLATION_RADIUS, share, max_relative_displacement(p, p + way)
+            0.5 * INFLATION_RADIUS, 0.2 * INFLATION_RADIUS, share, max_relative_displacement(p, p + displacement)
         )
-        x, y = pad_positions(p), pad_positions(p + way)
+        x, y = pad_positions(p), pad_positions(p + displacement)
         one, two = (
             find_candidate_pairs(points, triangles, x, y, limits),
             find_candidate_pairs(edges, edges, x, y, limits),
         )
         names = {(*points.primitives[i], *triangles.primitives[j]) for i, j in one}
         names |= {frozenset((tuple(edges.primitives[i]), tuple(edges.primitives[j]))) for i, j in two}
-        met = clustered_mesh.find_close_pairs(p, p + way, limits)
+        met = clustered_mesh.find_close_pairs(p, p + displacement, limits)
         expected, many = (
             clustered_mesh.pairs.vertices[met].tolist(),
             int(met[: clustered_mesh.pairs.num_point_triangle].sum()),
@@ -277,7 +277,7 @@ def test_patches_of_a_stack_give_no_bounds():
 
 
 def test_idle_contact_allows_only_free_displacements_and_mostly_without_a_query(monkeypatch):
-    mesh, arguments, ways = GridMesh().build_mesh(17), [], 0
+    mesh, arguments, num_displacements = GridMesh().build_mesh(17), [], 0
     surface = CollisionMesh.from_rest_shape(
         mesh.rest_positions,
         unique_edges(mesh.triangles),
@@ -294,15 +294,15 @@ def test_idle_contact_allows_only_free_displacements_and_mostly_without_a_query(
     p = mesh.rest_positions @ np.linalg.qr(rng.normal(size=(3, 3)))[0]
     for k in range(14):
         size = 0.2 if k % 8 == 0 else 0.004
-        way = size * np.sin(mesh.rest_positions @ rng.normal(size=3) * 2.0)[:, None] * rng.normal(size=3) + rng.normal(
+        displacement = size * np.sin(mesh.rest_positions @ rng.normal(size=3) * 2.0)[:, None] * rng.normal(
             size=3
-        )
-        if contact.collision_free_step_size(p, way) == 1.0:
+        ) + rng.normal(size=3)
+        if contact.collision_free_step_size(p, displacement) == 1.0:
             before = surface.find_proximity_candidates(p, 0.1)
             for t in np.linspace(0.0, 1.0, 5):
-                gap = compute_distances(before, p + t * way) - 0.006
+                gap = compute_distances(before, p + t * displacement) - 0.006
                 assert (gap >= 0.5 * MIN_GAP_FRACTION * (compute_distances(before, p) - 0.006)).all()
-            p, ways = p + way, ways + 1
+            p, num_displacements = p + displacement, num_displacements + 1
             assert (contact.value(p) == 0.0) == (len(surface.find_proximity_candidates(p, 0.012).vertices) == 0)
-    assert ways > 10
-    assert len(arguments) < ways
+    assert num_displacements > 10
+    assert len(arguments) < num_displacements

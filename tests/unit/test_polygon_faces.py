@@ -67,8 +67,8 @@ def test_areas_and_triangles_are_those_of_the_face_whichever_corner_comes_first(
     rest[renumbered] = np.array(points, float) @ turned + 5.0
     found = set()
     for shift in range(k):
-        for way in (1, -1):
-            faces = np.roll(renumbered, shift)[None, ::way]
+        for direction in (1, -1):
+            faces = np.roll(renumbered, shift)[None, ::direction]
             surface = triangulate_polygons(rest, faces)
             assert not surface.is_self_crossing.any()
             weights = compute_vertex_areas(rest, faces, surface)

@@ -175,7 +175,8 @@ def test_a_motion_within_one_percent_of_the_reference_is_the_same():
     }
     for distance, same in ((0.0, True), (0.0099, True), (0.0101, False), (0.03, False)):
         frames = [
-            solved | {"termination_reason": "converged", "reference_distance": way} for way in (0.0, distance, 0.0)
+            solved | {"termination_reason": "converged", "reference_distance": deviation}
+            for deviation in (0.0, distance, 0.0)
         ]
         found = classify_run(frames)
         assert (found.outcome, found.same_motion) == (CORRECT, same), distance

@@ -13,10 +13,10 @@ class LogStream:
     """A stream that records what is logged."""
 
     def __init__(self) -> None:
-        self.held: dict[str, Any] = {}
+        self.logged_data: dict[str, Any] = {}
 
     def log(self, entity: str, drawn: Any, *, static: bool) -> None:
-        self.held[entity] = drawn
+        self.logged_data[entity] = drawn
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 4, 5])
@@ -26,4 +26,4 @@ def test_each_curve_and_its_name_have_its_colour(count: int) -> None:
     drawn = {f"frame {k}": [1.0, 0.1 / (k + 1)] for k in range(count)}
     curve_drawing.draw_curves(cast(rr.RecordingStream, logged), "/curves", drawn, curve_drawing.pack_colours(given))
     for entity in ("/curves/lines", "/curves/words"):
-        assert logged.held[entity].colors.as_arrow_array().to_pylist()[-count:] == given
+        assert logged.logged_data[entity].colors.as_arrow_array().to_pylist()[-count:] == given

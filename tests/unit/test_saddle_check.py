@@ -63,17 +63,17 @@ def effect_steps(name: str) -> Iterator[tuple[StepProblem, Positions]]:
 
 
 def test_where_the_bound_is_satisfied_no_eigenvalue_is_negative():
-    held = [(eigenvalues(problem, p)[0], is_bounded(problem, p)) for problem, p in random_steps()]
-    assert all(least >= -ROUNDOFF for least, bounded in held if bounded)
-    counts = sum(bounded for _, bounded in held), sum(least < -ROUNDOFF for least, _ in held)
+    checks = [(eigenvalues(problem, p)[0], is_bounded(problem, p)) for problem, p in random_steps()]
+    assert all(least >= -ROUNDOFF for least, bounded in checks if bounded)
+    counts = sum(bounded for _, bounded in checks), sum(least < -ROUNDOFF for least, _ in checks)
     assert min(counts) > 20, f"{counts} of each kind are too few to tell"
 
 
 @pytest.mark.parametrize("name", ["strain limits", "all that are projective", "contact"])
 def test_the_bound_includes_elements(name: str):
-    held = [(eigenvalues(problem, p)[0], is_bounded(problem, p)) for problem, p in effect_steps(name)]
-    assert all(least >= -ROUNDOFF for least, bounded in held if bounded)
-    assert {bounded for _, bounded in held} == {True, False}
+    checks = [(eigenvalues(problem, p)[0], is_bounded(problem, p)) for problem, p in effect_steps(name)]
+    assert all(least >= -ROUNDOFF for least, bounded in checks if bounded)
+    assert {bounded for _, bounded in checks} == {True, False}
 
 
 def test_the_bound_of_an_element_counts_its_vertices():

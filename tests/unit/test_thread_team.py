@@ -52,10 +52,10 @@ def test_each_task_is_done_once_a_phase_and_phases_do_not_mix(threads, tasks):
     phases = 300
     team, log, counts = ThreadTeam.from_task_count(tasks), np.zeros(tasks, np.int64), np.zeros((threads, 2), np.int64)
     begin(team)
-    crew = [Thread(target=work, args=(team, k, phases, log, counts[k])) for k in range(threads)]
-    for thread in crew:
+    workers = [Thread(target=work, args=(team, k, phases, log, counts[k])) for k in range(threads)]
+    for thread in workers:
         thread.start()
-    for thread in crew:
+    for thread in workers:
         thread.join()
     assert counts[:, 0].sum() == tasks * (phases + 1)
     assert counts[:, 1].sum() == 0
