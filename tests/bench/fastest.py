@@ -9,13 +9,14 @@ these measures, where g is the objective:
 
     gap      (g - g*)/(g0 - g*), relative to the lowest known minimum
     error    largest distance of a vertex from its position in that minimum, over the same distance at the step's start
-    own-gap  gap relative to the certified minimum to which the method itself converges
+    own-gap  gap relative to the certified minimum in whose basin the method itself ends
 
 Minima are known from the search of references and, in `results`, from earlier runs of `springbench accuracy` with the
 config, which certify the ends of all its methods. The published ratios, except of `configs/stiff.yaml`, follow such a
 run. Where a step has several minima, which one a method reaches is chance; `own-gap` then measures how fast it
-converges to its own, and `excess` how much higher that is than the lowest known, as a gap. A method that converges to a
-point that is no certified minimum reaches no accuracy.
+converges to its own, and `excess` how much higher that is than the lowest known, as a gap. The basin is that of
+Newton's method from the end of the method after at most 3,000 iterations. A method that ends in the basin of no
+certified minimum reaches no accuracy.
 
 A method reaches an accuracy with its first iterate that satisfies it. A first pass evaluates all iterates. The methods
 that may be the fastest are then timed interleaved in one process, for several rounds, by the processor time of the
@@ -45,7 +46,8 @@ from springbench.harness.execution.machine_info import limit_threads
 from springbench.harness.experiments.accuracy.accuracy_units import open_reference_store
 from springbench.harness.experiments.accuracy.snapshot_rows import SnapshotEvaluation
 from springbench.harness.experiments.accuracy.step_scales import compute_vertex_distances
-from springbench.harness.reference.certified_minimum import certify_minimum
+from springbench.harness.reference.certified_minimum import refine_minimum
+from springbench.solvers.methods.newton.newton_direct import NewtonSolver
 from springbench.solvers.model.step_problem import Positions, PreparedSolver, StepProblem, StopRule, Unsupported
 from springbench.solvers.registry import SOLVER_TABLE, load_target
 
@@ -64,7 +66,7 @@ MAX_REPEATED_GROWTH = 1.5
 """A first pass that exceeds its time is repeated if it has more than this multiple of the iterates of the one before:
 kernels are compiled at their first use, and may take all the time of a pass."""
 CONVERGED = StopRule(3000, rtol=1e-9)
-"""End of the solve that finds the minimum to which a method converges."""
+"""End of the solve that finds the basin in which a method ends."""
 NUM_RESAMPLES, CONFIDENCE = 2000, 0.95
 
 
@@ -145,8 +147,11 @@ def build_gap(problem: StepProblem, lowest: float) -> Callable[[Positions], floa
 
 
 def find_own_minimum(prepared: PreparedSolver, problem: StepProblem) -> float:
-    """Return the objective [J] of the certified minimum to which a method converges, NaN if it is none."""
-    found = certify_minimum(problem, prepared.solve(problem, CONVERGED).positions)
+    """Return the objective [J] of the certified minimum in whose basin a method ends, NaN if it is none.
+
+    Basins are those of Newton's method.
+    """
+    found = refine_minimum(problem, prepared.solve(problem, CONVERGED).positions, NewtonSolver())
     return found.objective if found.is_certified else np.nan
 
 
