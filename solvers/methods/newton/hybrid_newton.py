@@ -13,19 +13,20 @@ positions at the end of the previous step. If H(t) has no Cholesky factor, the s
 one is added: along unstable directions the step is longer, the closer that multiple is to the minimum (More and
 Sorensen 1983).
 
-L-BFGS runs first. Its factor of Q is in float32, unless Q is so stiff that directions would have no correct digit: an
-iteration takes 5 to 14 % less time (200 to 1100 vertices, one core with AVX-512), and directions need no more digits.
-Residuals then have relative errors of 1e-7. The factor is in float64 if a connected component has no pins: directions
-then conserve its momentum. Sweeps do not; after them, the component is translated to its equilibrium
+L-BFGS runs first, and ends if its first four iterations more than double the residual: predicted tensions follow. Its
+factor of Q is in float32, unless Q is so stiff that directions would have no correct digit: an iteration takes 5 to 14
+% less time (200 to 1100 vertices, one core with AVX-512), and directions need no more digits. Residuals then have
+relative errors of 1e-7. The factor is in float64 if a connected component has no pins: directions then conserve its
+momentum. Sweeps do not; after them, the component is translated to its equilibrium
 (`springbench.solvers.kernels.free_components`). A solve whose initial guess is the current positions starts where the
 objective is lowest: there, at the inertial target (motion without forces) or at the inertial prediction (motion without
-springs). Near the minimum, segments of five iterations alternate with rounds of four sweeps
-of vertex block descent (`springbench.solvers.methods.quasi_newton.sweep_rounds`). More rounds of sweeps follow as long
-as each decreases the objective more per cost than the last segment did, or the residual to 0.32 of it. Near means that
-an iteration of L-BFGS decreases the objective by at most 5e-5 of the decrease since the initial guess, and by at most
-5e-3 of it if no diagonal entry of Q exceeds 5000 times the inertia: sweeps far from a minimum lead to other, higher
-minima, the more often the stiffer the springs are. The sweeps come first if no entry exceeds 500 times the inertia;
-there are none if one exceeds the inertia over the square root of the machine epsilon.
+springs). Near the minimum, segments of five iterations alternate with rounds of four sweeps of vertex block descent
+(`springbench.solvers.methods.quasi_newton.sweep_rounds`). More rounds of sweeps follow as long as each decreases the
+objective more per cost than the last segment did, or the residual to 0.32 of it. Near means that an iteration of L-BFGS
+decreases the objective by at most 5e-5 of the decrease since the initial guess, and by at most 5e-3 of it if no
+diagonal entry of Q exceeds 5000 times the inertia: sweeps far from a minimum lead to other, higher minima, the more
+often the stiffer the springs are. The sweeps come first if no entry exceeds 500 times the inertia; there are none if
+one exceeds the inertia over the square root of the machine epsilon.
 
 One rule decides which of the three methods continues: that with the largest decrease of the objective per cost in its
 last steps. A method that was not yet measured is credited with the decrease that L-BFGS leaves, extrapolated from its
