@@ -13,7 +13,7 @@ positions at the end of the previous step. If H(t) has no Cholesky factor, the s
 one is added: along unstable directions the step is longer, the closer that multiple is to the minimum (More and
 Sorensen 1983).
 
-L-BFGS runs first, and ends if its first four iterations more than double the residual: predicted tensions follow. Its
+L-BFGS runs first, and ends if its first four iterations increase the residual by half: predicted tensions follow. Its
 factor of Q is in float32, unless Q is so stiff that directions would have no correct digit: an iteration takes 5 to 14
 % less time (200 to 1100 vertices, one core with AVX-512), and directions need no more digits. Residuals then have
 relative errors of 1e-7. The factor is in float64 if a connected component has no pins: directions then conserve its
