@@ -234,8 +234,9 @@ def build_block_cases() -> Iterator[KernelCase]:
         "backward_solve_tile": plain.backward_solve_tile,
         "add_vector": plain.add_vector,
     }
-    # Only the call of the factorisation has matrix values.
-    arguments = capture_arguments(block_cholesky, "run_stages", build_solve("newton"), lambda call: len(call[2]))
+    # Only calls of the factorisation have matrix values; those that also solve have a right-hand side.
+    solve_newton = build_solve("newton")
+    arguments = capture_arguments(block_cholesky, "run_stages", solve_newton, lambda call: len(call[2]) * len(call[4]))
     fronts, schedule, values, panels, x, *team = arguments
     yield KernelCase("factorisation", block_multifrontal.run_stages, arguments, tiles, (3,))
     solve = fronts, factorisation_schedule.select_solve(schedule), values, panels, x, *team
