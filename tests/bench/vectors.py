@@ -56,6 +56,7 @@ from springbench.solvers.model.step_problem import Positions
 from springbench.solvers.objective.fixed_objective import FixedObjective
 
 from tests.bench import plain
+from tests.bench.factor_threads import build_newton_iteration
 from tests.bench.gates import STOP, build_sheet, prepare_solver
 from tests.bench.pairs import fold_sheet
 from tests.bench.scripted_study import describe_provenance, publish_rows
@@ -234,9 +235,8 @@ def build_block_cases() -> Iterator[KernelCase]:
         "backward_solve_tile": plain.backward_solve_tile,
         "add_vector": plain.add_vector,
     }
-    # Only calls of the factorisation have matrix values; those that also solve have a right-hand side.
-    solve_newton = build_solve("newton")
-    arguments = capture_arguments(block_cholesky, "run_stages", solve_newton, lambda call: len(call[2]) * len(call[4]))
+    iterate, *_ = build_newton_iteration(SIZE)
+    arguments = capture_arguments(block_cholesky, "run_stages", iterate, lambda call: len(call[2]))  # has matrix values
     fronts, schedule, values, panels, x, *team = arguments
     yield KernelCase("factorisation", block_multifrontal.run_stages, arguments, tiles, (3,))
     solve = fronts, factorisation_schedule.select_solve(schedule), values, panels, x, *team
