@@ -149,8 +149,8 @@ class _InterpretedSearch(ConjugateGradientIteration):
     def update_direction(self, product: float, previous_product: float) -> float:
         """Update the direction; return the curvature along it."""
         curvature_search.update_search_direction(self._scratch, product / previous_product)
-        free = np.s_[: len(self._scratch.residual), :3]
-        self._scratch.product[free] = self._hessian.matvec(np.ascontiguousarray(self._scratch.direction[free]))
+        vertices = np.s_[: len(self._scratch.residual), :3]
+        self._scratch.product[vertices] = self._hessian.matvec(np.ascontiguousarray(self._scratch.direction[vertices]))
         return curvature_search.measure_curvature(self._scratch)
 
     def update_iterate(self, product: float, curvature: float) -> float:

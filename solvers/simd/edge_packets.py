@@ -17,7 +17,6 @@ from springbench.solvers.simd.spring_packets import (
     BLOCK_ENTRIES,
     EDGE_STRIDE,
     LANES,
-    PACKET_TYPE,
     PacketBuilder,
     constant_packet,
 )
@@ -164,17 +163,15 @@ class EdgeBuilder:
     def _load_dashpots(self, entry: Any, arrow: list[Any]) -> tuple[list[Any], Any]:
         """Load m of an entry's dashpots, and compute m.v - q."""
         b, v = self._builder, self._vectors
-        at = b.gep(self._edges.dashpot_data, [b.mul(entry, I64(EDGE_STRIDE))])
-        *m, stretch = [v.load(b.gep(at, [I64(LANES * k)]), PACKET_TYPE) for k in range(4)]
+        *m, stretch = v.load_adjacent(self._edges.dashpot_data, b.mul(entry, I64(EDGE_STRIDE)), 4)
         stretch = b.fsub(_ZERO, stretch)
         for one, other in zip(m, arrow, strict=True):
             stretch = v.multiply_add(one, other, stretch)
         return m, stretch
 
     def _load_blocks(self) -> list[Any]:
-        b = self._builder
-        at = b.gep(self._edges.dashpot_blocks, [b.mul(self._packet_index, I64(BLOCK_ENTRIES * LANES))])
-        return [self._vectors.load(b.gep(at, [I64(LANES * k)]), PACKET_TYPE) for k in range(BLOCK_ENTRIES)]
+        first = self._builder.mul(self._packet_index, I64(BLOCK_ENTRIES * LANES))
+        return self._vectors.load_adjacent(self._edges.dashpot_blocks, first, BLOCK_ENTRIES)
 
     def _excess(self, length: Any, low: Any, high: Any) -> Any:
         """Return the length beyond the limits, negative below the minimum."""

@@ -117,8 +117,19 @@ class PacketBuilder(VectorBuilder):
             many: number of packets of each entry.
         """
         b = self.builder
-        begin = b.zext(b.load(b.gep(kind, [entry])), I64)
-        return [self.load(b.gep(table, [b.add(begin, I64(LANES * k))]), PACKET_TYPE) for k in range(many)]
+        return self.load_adjacent(table, b.zext(b.load(b.gep(kind, [entry])), I64), many)
+
+    def load_adjacent(self, array: Any, first: Any, many: int) -> list[Any]:
+        """Load adjacent packets.
+
+        Args:
+            array: pointer to float64.
+            first: index of the first number.
+            many: number of packets.
+        """
+        b = self.builder
+        at = b.gep(array, [first])
+        return [self.load(b.gep(at, [I64(LANES * k)]), PACKET_TYPE) for k in range(many)]
 
     def allocate_sums(self, many: int) -> list[Any]:
         """Allocate accumulators initialised with zero."""
@@ -224,10 +235,18 @@ class PacketBuilder(VectorBuilder):
 
     def squared_norm(self, a: list[Any]) -> Any:
         """Return |a|^2 of eight vectors."""
-        squared = self.builder.fmul(a[0], a[0], flags=("contract",))
-        for component in a[1:]:
-            squared = self.multiply_add(component, component, squared)
-        return squared
+        return self.inner_product(a, a)
+
+    def inner_product(self, a: list[Any], b: list[Any]) -> Any:
+        """Return the inner products of eight pairs of vectors.
+
+        Args:
+            a, b: packets of the components.
+        """
+        total = self.builder.fmul(a[0], b[0], flags=("contract",))
+        for one, other in zip(a[1:], b[1:], strict=True):
+            total = self.multiply_add(one, other, total)
+        return total
 
     def add_row(self, pointer: Any, row: Any) -> None:
         """Add a row to one in memory.
@@ -263,8 +282,7 @@ class PacketBuilder(VectorBuilder):
         Returns:
             Packets of x, y and z [N], and of stiffnesses [N/m].
         """
-        at = self.builder.gep(array, [self.builder.mul(packet, I64(RHS_STRIDE))])
-        return [self.load(self.builder.gep(at, [I64(LANES * k)]), PACKET_TYPE) for k in range(4)]
+        return self.load_adjacent(array, self.builder.mul(packet, I64(RHS_STRIDE)), 4)
 
     def prefetch_ahead(self, springs: SpringPacket, places: list[Any], right: Any, out: Any) -> None:
         """Prefetch the data that a packet PREFETCH_ROWS rows ahead will read.

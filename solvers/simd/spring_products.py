@@ -10,7 +10,7 @@ from typing import Any
 from numba import types
 from numba.extending import intrinsic
 from springbench.solvers.simd.llvm_vectors import I64, unpack_arguments
-from springbench.solvers.simd.spring_packets import LANES, PACKET_TYPE, PacketBuilder, SpringPacket
+from springbench.solvers.simd.spring_packets import LANES, PacketBuilder, SpringPacket
 
 LINEAR_STRIDE = 4 * LANES
 """Numbers of an entry's linearised springs: eight x, y, z [(N/m)^(1/2)] and transverse stiffnesses [N/m]."""
@@ -27,26 +27,19 @@ def _spring_product_code(
         places = v.load_row_offsets(springs.row_offset, number)
         centre, sums = v.gather_rows(x, places), v.allocate_sums(3)
 
-        def load_packets(array: Any, first: Any, many: int) -> list[Any]:
-            at = builder.gep(array, [first])
-            return [v.load(builder.gep(at, [I64(LANES * k)]), PACKET_TYPE) for k in range(many)]
-
         def read(entry: Any) -> list[Any]:
             """Load an entry's linearised springs, and the differences of x at their ends."""
             change = v.compute_spring_vectors(x, centre, springs.neighbour_offset, entry)
-            return [*load_packets(linear, builder.mul(entry, I64(LINEAR_STRIDE)), 4), *change]
+            return [*v.load_adjacent(linear, builder.mul(entry, I64(LINEAR_STRIDE)), 4), *change]
 
         def add(values: list[Any]) -> None:
             """Add an entry's springs to the sums."""
             normal, lateral, change = values[:3], values[3], values[4:]
-            stretch = builder.fmul(normal[0], change[0], flags=("contract",))
-            for one, other in zip(normal[1:], change[1:], strict=True):
-                stretch = v.multiply_add(one, other, stretch)
             v.add_products([lateral] * 3, change, sums)
-            v.add_products([stretch] * 3, normal, sums)
+            v.add_products([v.inner_product(normal, change)] * 3, normal, sums)
 
         v.pipeline_entries(springs.first_entry, springs.end_entry, read, add)
-        (stiffness,) = load_packets(diagonal, builder.mul(number, I64(LANES)), 1)
+        (stiffness,) = v.load_adjacent(diagonal, builder.mul(number, I64(LANES)), 1)
         total = [v.multiply_add(stiffness, a, builder.load(b)) for a, b in zip(centre, sums, strict=True)]
         for place, row in zip(places, v.transpose_to_rows(total), strict=True):
             v.store(row, builder.gep(out, [place]))

@@ -13,11 +13,11 @@ positions at the end of the previous step. If H(t) has no Cholesky factor, the s
 one is added: along unstable directions the step is longer, the closer that multiple is to the minimum (More and
 Sorensen 1983).
 
-L-BFGS runs first, and ends if its first four iterations increase the residual by half: predicted tensions follow. Its
-factor of Q is in float32, unless Q is so stiff that directions would have no correct digit: an iteration takes 5 to 14
-% less time (200 to 1100 vertices, one core with AVX-512), and directions need no more digits. Residuals then have
-relative errors of 1e-7. The factor is in float64 if a connected component has no pins: directions then conserve its
-momentum. Sweeps do not; after them, the component is translated to its equilibrium
+L-BFGS runs first, and ends if its first four iterations increase the residual by more than half: predicted tensions
+follow. Its factor of Q is in float32, unless Q is so stiff that directions would have no correct digit: an iteration
+takes 5 to 14 % less time (200 to 1100 vertices, one core with AVX-512), and directions need no more digits. Residuals
+then have relative errors of 1e-7. The factor is in float64 if a connected component has no pins: directions then
+conserve its momentum. Sweeps do not; after them, the component is translated to its equilibrium
 (`springbench.solvers.kernels.free_components`). A solve whose initial guess is the current positions starts where the
 objective is lowest: there, at the inertial target (motion without forces) or at the inertial prediction (motion without
 springs). Near the minimum, segments of five iterations alternate with rounds of four sweeps of vertex block descent
